@@ -1,4 +1,4 @@
-"""Reduction of a bake: surfels that are not drawn, stored or seen, tiles, and terms of view colours."""
+"""Reduction of a bake: invisible and unstorable surfels are dropped, tiles and view colours reduced."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -71,9 +71,8 @@ def drop_unseen(
 
 @torch.no_grad()
 def prune_and_resample(baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress) -> BakeState:
-    """Drop surfels that no view shows, and reduce tiles and view colours, as the options of a bake say.
-
-    Left out and counted are surfels that cannot be drawn or stored, or that no view blends. The atlas is not encoded.
+    """Drop surfels as `drop_unseen` does, and reduce tiles and view colours by the bake's options. The atlas is not
+    encoded.
 
     Args:
         baked: of `trained_texels` or `field_tiles`.

@@ -1,5 +1,5 @@
-"""Errors of texels as the closest training view shows them: times the blending weight, averaged over its pixels; and
-the certificate of a bake, their errors by quantisation."""
+"""Errors of texels as the closest training view shows them (times the blending weight, averaged over each pixel), and
+the certificate of a bake, which states those due to quantisation."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is eva
 
 
 def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
-    """Compute `weighted_rms` as a view sees it: difference x weight, averaged over pixels of `cells` [n, 2] first."""
+    """Compute `weighted_rms` as a view shows it: difference x weight, averaged over a pixel's `cells` [n, 2] first."""
     return weighted_rms(averaged(difference * weight[:, None], cells), (weight > 0).float())
 
 
@@ -33,14 +33,14 @@ def listed_errors(
     """Measure differences of texels as the closest training view shows them.
 
     Args:
-        difference: [T, 3] in the order of `ops.TexelTiles`: a surfel without a tile has one.
+        difference: [T, 3] in the order of `ops.TexelTiles`, with one texel for a surfel without a tile.
         sizes: [N, 2] sides of the tiles; (0, 0) = none.
         shown: how much of the tiles is seen, N rows.
         chunk: texels taken at once (a tile is never split).
 
     Returns:
-        [N] root mean squares in 8-bit steps, each times the largest blending weight that a fragment has there; and [N]
-        bool, whether any fragment of the surfel gets a residual.
+        [N] root mean squares, in 8-bit steps, of the differences times the largest blending weight of a fragment at the
+        texel; and [N] bool, whether any fragment of the surfel gets a residual.
     """
     errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
     first, bare = first_texels(sizes), torch.nonzero(sizes[:, 0] == 0).squeeze(1)
@@ -55,21 +55,21 @@ def listed_errors(
 
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
-    """Count the pixels of a scale unit of every surfel along u and v in the view that shows it largest: [N, 2]; 0 where
-    no view shows it.
+    """Compute the pixels per scale unit [N, 2] of every surfel along u and v in the view that shows it largest; 0 if no
+    view shows it.
 
     Args:
         surfels: per-surfel parameters, N rows.
-        extent: half side in scale units of the square that has to be in the picture.
-        near: nearest drawn depth.
+        extent: half side, in scale units, of the square that has to meet the image for a view to count.
+        near: near plane, camera z.
     """
     at = (surfels["means"], tangents(surfels["quats"]), surfels["log_scales"].exp())
     return max_projected_extent(*at, cameras, extent, near) / (2.0 * extent)
 
 
 def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) -> Tensor:
-    """Count the cells [n, 2] of a grid over the tiles `rows` that a pixel of the closest view covers along u and v,
-    from 1 to the side of the grid; 1 if unknown."""
+    """Compute how many cells [n, 2] along u and v a pixel of the closest view covers, for tiles `rows` with a grid of
+    `size` (u, v) each: at least 1, at most the side of the grid; 1 if the view is unknown."""
     extent = shown.extent[rows]
     sides = torch.tensor(size, dtype=torch.float32, device=extent.device).expand(len(extent), 2)
     if shown.pixels is None:
@@ -79,9 +79,9 @@ def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) 
 
 
 def averaged(values: Tensor, cells: Tensor) -> Tensor:
-    """Average values [n, c, v, u] over rectangles about every cell.
+    """Average values over a rectangle about every cell: a moving average whose width differs by tile.
 
-    A rectangle that would reach beyond the grid is moved into it. One of a single cell leaves its value.
+    A rectangle that would reach beyond the grid is moved into it. With rectangles of one cell, values stay as they are.
 
     Args:
         values: [n, c, v, u].
@@ -93,7 +93,8 @@ def averaged(values: Tensor, cells: Tensor) -> Tensor:
 
 
 def _windows(count: int, width: Tensor) -> Tensor:
-    """Compute the share [n, count, count] of every cell in the window of each, of widths [n]."""
+    """Build matrices [n, count, count] of a moving average: row i has every cell's share of the window about cell i,
+    for windows of `width` [n] cells."""
     edge, half = torch.arange(count, device=width.device, dtype=torch.float32), width[:, None] / 2
     center = torch.minimum(torch.maximum(edge + 0.5, half), count - half)  # [n, count]
     low, high = (center - half)[:, :, None], (center + half)[:, :, None]

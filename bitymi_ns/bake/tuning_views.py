@@ -1,4 +1,4 @@
-"""Texels of a bake as they learn against the photographs: their list, and the views, traced once and kept."""
+"""Fine-tuning of a bake's texels on the photographs: the list of texels, and views traced once and cached."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class TexelList:
         scene: the surfels, on the device.
         tiles: where the texels lie.
         values: [T, 3] residual colours as baked, on the device.
-        alpha: opacities of the texels on the device, which stand still; None = opaque texels.
+        alpha: opacities of the texels on the device, which are not tuned; None = opaque texels.
     """
 
     def __init__(self, baked: BakeState, device: torch.device | str = "cpu") -> None:
@@ -70,12 +70,12 @@ class TexelList:
 
 
 LEAST_KEPT = 1 / 8
-"""Share of the views that fits where any are kept: of fewer, the memory is worth more than the time that they save."""
+"""Least share of the views that must fit the budget for any to be kept: fewer save too little time."""
 
 
 @dataclass
 class TuningView:
-    """A photograph, and what the texels add to its picture."""
+    """A photograph and its traced view: the fragments with texels, and the render of everything else."""
 
     lists: list[Fragments]  # the fragments that show a texel, in bands from top to bottom
     base: Tensor  # [N, 3] f_view of every surfel
@@ -122,7 +122,7 @@ class TuningViews(Sequence[TuningView]):
     @torch.no_grad()
     def _traced(self, view: View) -> TuningView:
         scene, projection = self._texels.scene, self._texels.projection(view.camera)
-        # Only the unused beta map needs a view's own projection: one is kept for all.
+        # The first view's projection serves all: blending reads it for the beta channel only, which is unused.
         self._projection = self._projection or projection
         p, camera = scene.surfels, projection.camera
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
@@ -154,7 +154,7 @@ class TuningViews(Sequence[TuningView]):
             yield image, chosen
 
     def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
-        """Draw texels with the exposure of the photograph: [H, W, 3].
+        """Render a view with texels, and apply its photograph's correction: [H, W, 3].
 
         Args:
             view: of this sequence.
@@ -169,7 +169,7 @@ class TuningViews(Sequence[TuningView]):
     def step(
         self, index: int, texels: Tensor, share: Tensor, rate: float, ssim_weight: float, read: Tensor | None = None
     ) -> None:
-        """Move texels by the gradient of a view's loss, as a sum over its numbers.
+        """Take a gradient step on texels with a view's loss, summed over pixels and channels instead of averaged.
 
         Args:
             texels: [T, 3], moved in place: texel t by -rate share[t] times its gradient.

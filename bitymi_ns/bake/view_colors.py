@@ -1,4 +1,4 @@
-"""View colours of fewer terms: within the tolerance, and for compact bundles as the pictures pay for them."""
+"""View colours of fewer terms: within the tolerance, and for compact bundles by rate-distortion."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,12 +21,12 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 
-BITS_PER_NUMBER = 5.5  # bits of a number of a term in a compact bundle, about
-LEAST_WEIGHT = 1e-12  # weight of any direction: a surfel that no view shows has a colour, too
+BITS_PER_NUMBER = 5.5  # approximate bits per number of a term in a compact bundle
+LEAST_WEIGHT = 1e-12  # added to the weight of every direction, so that surfels which no view shows have a mean
 VIEW_SHARE = 0.5  # weight of the training views; the rest are directions between and around them
-BLIND = 4  # directions from so many of the nearest views that do not show the surfel count, too
+BLIND = 4  # number of nearest views without the surfel whose directions count as well
 BLIND_SHARE = 0.1
-"""Weight of these as a share of what a view would show of the surfel from there: a new view may show it."""
+"""Weight of these directions, as a share of what a view from there would show: a new view may show the surfel."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class ColorChoices:
     # [N, most + 1] squared error in the views, summed over pixels and channels, of every number of terms; infinite
     # where that number is no choice
     error: Tensor
-    largest: Tensor  # [N] largest error of the most terms over all directions, times the blending weight, 8-bit steps
+    largest: Tensor  # [N] largest error with the most terms, over all directions, times blending weight, 8-bit steps
     width: int  # numbers of a term
     # rows [n] int64 of surfels, and their base colours [n, 3] and terms [n, number, width] for a number of terms
     choices: Sequence[tuple[Tensor, Tensor, Tensor]]
@@ -70,7 +70,7 @@ def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
     entry = VIEW_COLORS[kind]
     numbers = range(most + 1) if entry.sites is not None else sorted({0, most})
     of_surfel = 4 * (most + 1) + sum(8 + 4 * (3 + entry.lean_width * number) for number in numbers)
-    return surfels * (of_surfel + views)  # whether a view shows a surfel
+    return surfels * (of_surfel + views)  # a bool per view: whether it shows the surfel
 
 
 def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Tensor:
@@ -111,10 +111,10 @@ def color_choices(
     squares. A surfel for which none is good enough keeps all sites. Surfels of a kind without sites (`ViewColor.sites`)
     keep one colour, or all terms.
 
-    Colours of fewer terms are choices, too, with the error that they make in the pictures: squared, in every view times
-    what it shows of the surfel. Half of it is that in the training views, half the mean of directions between and
-    around them. Beside these, views that pass close by a surfel without looking at it count by what they would show of
-    it: the next view does look, and has nothing else to go by. Sites are fitted to this error.
+    Colours of fewer terms are choices, too, each with its squared error in the pictures, weighted by what the views
+    show of the surfel (`squares`): half of the weight lies on the directions of the training views, half on directions
+    between and around them. Directions from the nearest views that do not show the surfel add to it, by what those
+    would show, as a new view from near there may show it. Sites are fitted to this error.
 
     Args:
         surfels: per-surfel parameters, N rows; their device does the work.
@@ -123,7 +123,7 @@ def color_choices(
         centers: [V, 3] float64 camera centres.
         opacity: [N] largest blending weight.
         tolerance: 8-bit steps.
-        near: nearest drawn depth.
+        near: near plane; views count as at least that far from a surfel.
 
     Returns:
         on the CPU.
@@ -141,7 +141,7 @@ def color_choices(
         target = shown_at(kind, dict(zip(entry.names, own, strict=True)), at.unit)
 
         def rest_of(rows: Tensor, base: Tensor, terms: Tensor, shown: Tensor) -> Tensor:
-            """Add a choice for rows of the chunk; returns those that it does not keep within the tolerance."""
+            """Record a choice for rows of the chunk; return the rows whose error exceeds the tolerance."""
             away = shown - target[rows]  # noqa: B023 - called in this round alone
             square = (away.square().sum(2) * weight[rows]).sum(1)  # noqa: B023
             bad = beyond("view_base", kind, base).any(1) | beyond("view_terms", kind, terms).flatten(1).any(1)
@@ -178,7 +178,8 @@ def color_choices(
 
 
 def _weights(at: Directions, weights: Tensor) -> Tensor:
-    """Weight an error at each direction, [n, D], by the weights [V, n] of the views."""
+    """Compute the weights [n, D] of the directions from the views' weights [V, n]: `VIEW_SHARE` of a view's
+    weight for its own direction, the rest spread evenly over the directions of no view."""
     of_views = weights.T.gather(1, at.view) * at.valid[:, : at.views]
     rest = at.valid.shape[1] - at.views
     between = (1 - VIEW_SHARE) * of_views.sum(1, keepdim=True) / max(1, rest)
@@ -186,9 +187,9 @@ def _weights(at: Directions, weights: Tensor) -> Tensor:
 
 
 def _blind(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
-    """Find directions [n, BLIND, 3] from the nearest views that do not show a surfel, and their weights: by what the
-    views that do show would show from there, by the square of the distance; none from where there is no such view.
-    `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
+    """Find the directions [n, BLIND, 3] from the nearest views that do not show a surfel, and their weights [n, BLIND]:
+    a share of the mean weight of the views that show it, scaled by the inverse square of the distance; 0 where there is
+    no such view. `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
     offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
     square, shows = offset.square().sum(2).clamp(min=near * near), weights.T > 0
     from_unit = (weights.T * square).sum(1) / shows.sum(1).clamp(min=1)
@@ -237,8 +238,8 @@ def view_color_errors(
 def reduce_view_colors(
     inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
 ) -> tuple[dict[str, Tensor], ColorChoices | None, ViewColorError | None]:
-    """Reduce the view colours within the tolerance: the surfels, the choices of fewer terms, and the error. A tolerance
-    of 0 keeps all."""
+    """Reduce the view colours within the tolerance. Return the surfels with lean view colours, the choices of fewer
+    terms and the error; a tolerance of 0 keeps all terms."""
     surfels, tolerance = dict(inputs.surfels), options.tolerance
     if tolerance == 0:
         return surfels, None, None
@@ -271,18 +272,19 @@ loosely instead of diverging."""
 
 
 def site_colors(vectors: Tensor, rgb: Tensor, directions: Tensor) -> Tensor:
-    """Compute sum_k softmax_k(v_k . d) rgb_k: [n, D, 3] from [n, K, 3] twice, and [n, D, 3]."""
-    weights = torch.softmax(vectors @ directions.transpose(1, 2), dim=1)  # far slower along a last axis of few numbers
+    """Compute sum_k softmax_k(v_k . d) rgb_k, [n, D, 3], from sites v and rgb [n, K, 3] and directions d [n, D, 3]."""
+    weights = torch.softmax(vectors @ directions.transpose(1, 2), dim=1)  # far slower along a short last axis
     return weights.transpose(1, 2) @ rgb
 
 
 def fewer_sites(
     at: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
 ) -> Callable[[int, Tensor], tuple[Tensor, Tensor]]:
-    """Fit the most needed sites to the colour of all, by Levenberg-Marquardt.
+    """Rank the sites by how much they are needed, and return a fit of the first ones to the colour of all, by
+    Levenberg-Marquardt.
 
     Args:
-        weight: [n, D'] of those that `Directions.subset` leaves.
+        weight: [n, D'] of the directions that `Directions.subset` selects.
         vectors, rgb: [n, K, 3] of all sites.
 
     Returns:

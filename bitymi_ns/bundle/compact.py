@@ -136,7 +136,7 @@ def decode_texels(
 
 
 def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
-    """Pack the tiles; the packing follows from their sizes.
+    """Compute the layout of the tiles in pages, which follows from their sizes.
 
     Raises:
         StreamError: the pages differ from those in bundle.json.

@@ -55,7 +55,7 @@ def _is_file_name(name: str) -> bool:
 
 
 def _only(value: float) -> Any:
-    """Return the type of a renderer constant: written for other programs, every other value refused."""
+    """Build the type of a renderer constant, which is written for other programs; reading refuses any other value."""
 
     def check(found: float) -> float:
         if found != value:
@@ -66,7 +66,7 @@ def _only(value: float) -> Any:
 
 
 def points_text(points: Tensor) -> str:
-    """Encode points with a rate, [P, 4], for bundle.json: base64 of little-endian float32 rows x, y, z, rate."""
+    """Encode points [P, 4] as base64 of little-endian float32 rows x, y, z, rate (pixels per unit of length)."""
     return base64.b64encode(points.detach().float().cpu().numpy().astype("<f4").tobytes()).decode()
 
 

@@ -40,14 +40,14 @@ def _number(value: Any) -> Any:
 Whole = Annotated[int, Field(ge=0, le=2**31 - 1)]
 Count = Annotated[int, Field(ge=0, le=2**60)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
-Measured = Annotated[NotNegative | None, BeforeValidator(_number)]  # None: not a number
+Measured = Annotated[NotNegative | None, BeforeValidator(_number)]  # None: not finite
 Share = Annotated[float, Field(ge=0, le=1)]
 Decibels = Annotated[Annotated[float, Field(ge=-1e3, le=1e3)] | None, BeforeValidator(_number)]
-"""None: not a number, as the pictures are equal or no pixel counts."""
+"""None: not finite, as the pictures are equal or no pixel counts."""
 
 
 class Percentiles(Part):
-    """Percentiles of an error over the surfels; p100 is the largest. None: not a number."""
+    """Percentiles of an error over the surfels; p100 is the largest. None: not finite, or too large to be stated."""
 
     p50: NotNegative | None = None
     p90: NotNegative | None = None
@@ -78,7 +78,7 @@ class Certificate(Part):
 
     @classmethod
     def of(cls, errors: Tensor, tolerance: float) -> Certificate:
-        """Count errors [n], 8-bit steps, by the tolerance."""
+        """Count the errors [n], 8-bit steps, within the tolerance and beyond it."""
         within = int((errors <= tolerance).sum())
         worst = float(errors.amax()) if len(errors) else 0.0
         return cls(against="texels", tolerance=tolerance, within=within, beyond=len(errors) - within, worst=worst)
@@ -179,7 +179,8 @@ class FineTuning(Part):
 
 
 class HeldOut(Part):
-    """PSNR over the held-out views, dB: means, and the view where the bundle differs most from the trained scene."""
+    """Mean PSNR over the held-out views, dB, of the bundle (`baked`), the trained scene (`neural`) and the photographs
+    against each other; `worst`: of the view where the bundle differs most from the trained scene."""
 
     views: Whole | None = None
     psnr_baked_against_neural: Decibels = None

@@ -20,16 +20,16 @@ from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, Photograph, Pose,
 from bitymi_ns.trust import leads_inside, listed
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""[4, 4] COLMAP's world, up about -y, to nerfstudio's with z up, as nerfstudio's parser does."""
+"""Transform [4, 4] from COLMAP's world, up about -y, to z up, as in nerfstudio's COLMAP parser."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Input of structure from motion, for a run that keeps its model."""
+    """Photographs or video that structure from motion was run on, recorded by a training run that keeps the model."""
 
     kind: Literal["photographs", "video"]
     path: str  # folder that was searched for photographs, or the video, relative to the capture
-    photographs: str | None  # their folder, relative to the capture; None = upright copies or frames, which may go
+    photographs: str | None  # their folder, relative to the capture; None = temporary upright copies or frames
     settings: SfmSettings | None = None  # None = unknown
 
 
@@ -57,7 +57,7 @@ class Source:
         return self.copies or self.photographs
 
     def files(self) -> list[Path]:
-        """Find the files of the model's images; missing ones under the model's names."""
+        """Find the files of the model's images; for a missing one, return the path that the model names."""
         names = [image.name for image in self.model.images]
         finder = FileFinder(self.image_folder)
         return [path or finder.missing(name) for path, name in zip(finder.find_all(names), names, strict=True)]
@@ -78,7 +78,7 @@ class Source:
 
 
 def find_source(found: Found, images: Path | None, masks: Path | None, downscale: int, need_photos: bool) -> Source:
-    """Find photographs and masks of a COLMAP model, at stated paths in the capture, or below it."""
+    """Find the photographs and masks of a COLMAP model: at stated paths in the capture, else by searching it."""
     names = [image.name for image in read_model(found.path).images]
     photographs = _find_folder(names, found.path, found.folder, images, downscale, need_photos)
     masks = find_masks(photographs, found.folder, masks, downscale)
@@ -100,8 +100,12 @@ def make_source(
 def _find_folder(
     names: Sequence[str], folder: Path, capture: Path, stated: Path | None, downscale: int, need_photos: bool
 ) -> Path:
-    """Find the folder with most of these photographs of a model, which may be missing unless needed: `stated`, or below
-    the capture; above it, too, if it is the model's `folder`. Raises CaptureError: none has any."""
+    """Find the folder that has most of a model's photographs: `stated`, else in `capture`, or up to three levels above
+    it if it is the model's `folder`.
+
+    Raises:
+        CaptureError: photographs are needed, and `stated` is missing or no folder has any.
+    """
     if stated is not None:
         if not need_photos or (capture / stated).is_dir() or (capture / f"{stated}_{downscale}").is_dir():
             return capture / stated
@@ -148,7 +152,7 @@ def _find_folder(
 
 
 def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks, or the stated one relative to the capture, which must exist; see `mask_folder`."""
+    """Find the folder of masks: `stated`, relative to the capture, which must exist, else as in `mask_folder`."""
     try:
         return mask_folder(photographs, capture, None if stated is None else capture / stated, downscale)
     except CaptureError as error:
@@ -160,7 +164,7 @@ def _name_in(folder: Path, path: Path) -> str:
 
 
 def warn_left_out(source: Source) -> set[Path]:
-    """Report photographs that the model lacks, and those with other names than it states; return them all."""
+    """Report photographs that the model lacks or names differently; return the paths of all, in the model or not."""
     files = source.files()
     other = renamed_message([image.name for image in source.model.images], files, source.image_folder)
     if other:
@@ -197,7 +201,7 @@ def model_points(model: Model, frame: Pose) -> Points:
 
 
 def _camera_to_world(image: ModelImage) -> Pose:
-    """[4, 4] camera to world in nerfstudio's camera axes (x right, y up, z backward)."""
+    """Compute the camera-to-world matrix [4, 4] for nerfstudio's camera axes (x right, y up, z backward)."""
     w, *xyz = image.qvec / np.linalg.norm(image.qvec)
     rotation = pycolmap.Rotation3d(np.array([*xyz, w])).matrix()
     c2w = np.eye(4)

@@ -34,10 +34,10 @@ def without_extension(parts: Parts) -> Parts:
 
 @dataclass
 class FileFinder:
-    """Finds files below a folder by names that machines and programs may have changed, if only one file fits.
+    """Finder of files below a folder by names that machines and programs may have changed, if only one file fits.
 
-    Tries, in order: the exact name; other separators, case, Unicode form or leading folders, as of absolute names;
-    another extension, or none.
+    Names are compared exactly first; then with other separators, case, Unicode form or leading folders, as of absolute
+    names; then with another extension, or none.
     """
 
     folder: Path  # to which names are relative
@@ -56,7 +56,7 @@ class FileFinder:
         return self._match(parts, self._whole) or next(filter(None, (self._match(p, self._stems) for p in stems)), None)
 
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
-        """Find files of several names. A file that fits two names is that of the exact one, or of none."""
+        """Find the files of several names. A file that fits several is that of its exact name, or of none."""
         found = [self.find(name) for name in names]
         exact = [self.folder / name == path for name, path in zip(names, found, strict=True)]
         users, sure = Counter(found), Counter(path for path, same in zip(found, exact, strict=True) if same)
@@ -74,7 +74,7 @@ class FileFinder:
         return self.folder.joinpath(*("_" if part in ("/", "//", "..") else part for part in parts))
 
     def ambiguous(self, name: str) -> list[str]:
-        """List the files that a name without extension may mean, if there are several."""
+        """List the files that a name may mean apart from its extension, if there are several."""
         files = self._stems.get(without_extension(folded(name)), [])
         return [path.relative_to(self.folder).as_posix() for path in files] if len(files) > 1 else []
 
@@ -117,7 +117,7 @@ class FileFinder:
             yield from (Path(folder, name) for name in files if name.lower().endswith(self.extensions))
 
 
-# os.path.isfile, unlike Path.is_file, also takes names that are too long for this system, or extended to be so.
+# os.path.isfile, unlike Path.is_file, is False for paths too long for the file system, instead of raising.
 def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
     """Fail if photographs of a capture's file or folder are missing, with similar names of existing files."""
     names = list(dict.fromkeys(files))
@@ -132,8 +132,8 @@ def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
 
 
 def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None = None) -> None:
-    """Report pictures of a capture that are not used; the `used` ones may be replaced by copies that are smaller by
-    `downscale`."""
+    """Report the pictures of a capture that are not `used`, except folders of copies smaller by `downscale`, such as
+    `images_2`."""
     named = frozenset(Path(os.path.normpath(path)) for path in used if path is not None)
     others = passed_over(Path(os.path.normpath(folder)), named)
     if downscale is not None:
@@ -152,7 +152,7 @@ def _hint(folder: Path, file: Path) -> str:
 
 
 def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:
-    """Describe files found under other names; empty = none. Names without extension and either separator are usual."""
+    """Describe files found under other names; empty = none. A missing extension or other separators do not count."""
 
     def is_usual(name: str, file: Path) -> bool:
         plain = Path(os.path.normpath(folder / name.replace("\\", "/")))
@@ -167,7 +167,7 @@ def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -
 
 
 def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:
-    """Report files with other names than stated, and those outside the folder: results show them."""
+    """Report files with other names than stated, and warn of those outside the folder, as results will show them."""
     other = renamed_message(names, files, path.parent)
     if other:
         say(f"{path}: {other}")
@@ -179,7 +179,8 @@ def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks:
 
 
 def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:
-    """Find the photographs of a file; missing ones keep their stated names. Fail if a name fits more than one file."""
+    """Find the photographs that the metadata file `path` names; missing ones keep their stated names. Fail if a name
+    fits more than one file."""
     folder = path.parent
     finder = FileFinder(folder, outside=True)
     found = finder.find_all(names)

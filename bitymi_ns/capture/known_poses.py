@@ -38,12 +38,12 @@ class KnownView:
 def triangulate(
     capture: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs with known cameras, which stay as they are; cache and continue in the folder
-    `capture` as `find_poses` does.
+    """Triangulate points from photographs with known cameras, which are not refined. The model is cached, and an
+    interrupted run resumed, in the folder `capture` as by `find_poses`.
 
     Returns:
-        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the poses, with names as seen
-        from the capture.
+        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the poses, with image names
+        relative to `capture`.
 
     Raises:
         CaptureError: too few points can be found; says what may be wrong.
@@ -74,7 +74,7 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     """Triangulate points from photographs with poses; None (with a warning) if that fails."""
     middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)
     mirrored = [bool(np.linalg.det(photograph.pose[:3, :3]) < 0.0) for photograph in photographs]
-    mirror = MIRROR if all(mirrored) else np.eye(3)  # photographs of a mirrored capture are not mirrored
+    mirror = MIRROR if all(mirrored) else np.eye(3)  # undoes mirrored poses: the photographs are not mirrored
     views = []
     for photograph in photographs:
         camera = photograph.camera

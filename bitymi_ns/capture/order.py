@@ -15,8 +15,8 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 
 class Neighbours:
-    """Finds the previous and next photograph of a sequence: files in one folder, which several cameras may share, whose
-    names differ only in numbers."""
+    """Sequences of photographs: files in one folder, which several cameras may share, whose names differ only in
+    numbers."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         found = defaultdict(list)
@@ -27,7 +27,7 @@ class Neighbours:
 
     def of(self, file: Path) -> tuple[int, int, float] | None:
         """Return the indices of the previous and next photograph, and the file's position between them, 0 to 1, by the
-        first number that differs; past an end, twice the last one. None: unknown sequence."""
+        first number that differs; beyond an end of the sequence, that end twice and 0. None: unknown sequence."""
         sequence, position = _numbered(file)
         members = self._sequences.get(sequence)
         if members is None:

@@ -33,13 +33,14 @@ COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
 CHECK_VIEWS = 8  # photographs, spread over all, into which points are projected to check conventions
 CHECK_POINTS = 2000
-CHECK_SIZE = 800  # least longer side of JPEG files that are decoded for that check, pixels
+CHECK_SIZE = 800  # least longer side that JPEG files are decoded at for that check, pixels
 NOTHING, SOMETHING = 0.01, 0.1
-"""Shares of the points in pictures by wrong poses, and by poses that may be right."""
+"""Shares of the points that project into pictures: below the first by wrong poses, above the second by right ones."""
 MANY_TIMES, MORE_ALIKE = 2.5, 0.05
-"""Factor of the points and difference of the correlation of brightness that tell right poses. In three real captures
-right ones show 70 to 76 % of the points with a correlation of 0.21 to 0.56, others at most 24 % with 0.12."""
-ALIKE = 0.4  # difference of the correlation that suffices alone: a room has points on all sides
+"""Least ratio of these shares, and least difference in the correlation of brightness, of right poses to wrong ones. In
+three real captures, right poses show 70 to 76 % of the points with a correlation of 0.21 to 0.56, others at most 24 %
+with 0.12."""
+ALIKE = 0.4  # least correlation, and difference in it, that suffice alone: a room has points on all sides
 
 
 class Points(NamedTuple):
@@ -50,8 +51,8 @@ class Points(NamedTuple):
 
 
 def read_points(path: Path) -> tuple[Points, str]:
-    """Read the points of a file without `ply_fault`, and why they have no colors, in words that follow "points: ".
-    Raises PlyError: its points have lists, or follow some."""
+    """Read the points of a PLY file in which `ply_fault` finds none, and the reason, a clause, why they have no colors;
+    empty if they have. Raises PlyError: its points have list properties, or follow an element with some."""
     header = read_header(path)
     rows = read_rows(path, header, VERTEX)
     xyz = np.stack([rows[name] for name in "xyz"], -1).astype(np.float64)
@@ -66,8 +67,8 @@ def read_points(path: Path) -> tuple[Points, str]:
 
 
 def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.NDArray[np.uint8], str]:
-    """Convert colors [N, 3] to bytes by the smallest white (1 if `floating`, 255, 65535) that bounds them, or to [0, 3]
-    and why that fails."""
+    """Convert colors [N, 3] to bytes. White is the smallest number that bounds them: 1 or 255 if `floating`, else 255
+    or 65535. Return [0, 3] and the reason if none does. Non-finite `values` become 0 in place."""
     none = np.zeros((0, 3), np.uint8)
     if not len(values):
         return none, ""
@@ -102,7 +103,7 @@ def ply_fault(path: Path) -> str | None:
 
 @lru_cache(maxsize=2)  # captures are checked twice, which takes seconds for large clouds
 def _bad_line(path: Path, changed: int) -> str | None:
-    """Find a text file's first line that is no point; None = none."""
+    """Describe the fault of a text file's first line that is no point; None = none."""
     header = read_header(path)
     points = header.elements[VERTEX]
     if header.order or points.row is None or not points.count:
@@ -168,8 +169,8 @@ def with_colors(points: Points, without: str, photographs: Sequence[Photograph],
 
 
 def color_points(points: Points, photographs: Sequence[Photograph]) -> Points:
-    """Color each point by its median over the photographs that it projects into, robust to those in which it is hidden;
-    grey without any."""
+    """Color each point by the median over those of `COLOR_VIEWS` photographs that it projects into, robust to those in
+    which it is hidden; grey if it projects into none."""
     chosen = [photographs[i] for i in spread(len(photographs), COLOR_VIEWS)]
     images = [np.asarray(read_image(photograph.file).convert("RGB")) for photograph in chosen]
     rgb = np.full((len(points.xyz), 3), GREY, np.uint8)
@@ -233,7 +234,7 @@ COLMAP_POSES: Conventions = {
 
 
 class _Fit(NamedTuple):
-    """Share of points that project into pictures, and correlation of their brightness; 0 without colors."""
+    """Share of points that project into pictures; correlation of their brightness with the pixels', 0 if unknown."""
 
     share: float
     correlation: float

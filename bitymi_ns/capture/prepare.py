@@ -21,8 +21,8 @@ IMAGES = "images"  # subfolder of the work folder for upright copies, or a video
 def upright_photos(
     photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
 ) -> tuple[Path, dict[str, str]]:
-    """Make every photograph upright and readable by everything; return the folder, and the names in it by photograph:
-    `folder` itself if none needs a copy, else `images` in the work folder, with links to the others."""
+    """Write upright JPEG copies of the photographs that need one. Return the folder to read (`folder` itself if none
+    does, else `images` in the work folder, with links to the others), and the names in it by photograph."""
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
     names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}
@@ -35,7 +35,8 @@ def upright_photos(
                 path.parent.mkdir(parents=True, exist_ok=True)
                 if photo.plain:
                     there = os.path.realpath(target / names[photo.name])
-                    path.symlink_to(os.path.relpath(photo.path.resolve(), os.path.dirname(there)))  # may move together
+                    # relative, so that both folders may be moved together
+                    path.symlink_to(os.path.relpath(photo.path.resolve(), os.path.dirname(there)))
                 else:
                     picture = upright(photo)
                     picture.save(path, quality=JPEG_QUALITY, subsampling=0, exif=picture.info["exif"])
@@ -51,8 +52,9 @@ def emptied(folder: Path) -> Path:
 
 
 def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, target: Path) -> None:
-    """Write masks for COLMAP to `target`, by its `names` of the photographs. A photograph without a mask counts whole.
-    Raises CaptureError: a mask cannot be read, or has another aspect ratio than its photograph, or there is none."""
+    """Write masks for COLMAP to `target`, named after `names`, the photographs' names in its database. All pixels of a
+    photograph without a mask count. Raises CaptureError: a mask cannot be read, or has another aspect ratio than its
+    photograph, or no photograph has one."""
     found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
     if not found:
         advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out (--use-masks False)"

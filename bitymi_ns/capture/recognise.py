@@ -95,8 +95,8 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
-    """Find the only subfolder that is a capture with poses, as archives unpack to; None = none, several, or photographs
-    beside it."""
+    """Find the only subfolder that is a capture with poses, as unpacked archives have; None = none, several, or
+    photographs beside it."""
     if folder_contents.has_photographs(folder):
         return None
     found = []
@@ -132,9 +132,10 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
-    """Yield transforms.json and Blender's files, else files of other names with the same content."""
+    """Yield transforms.json and Blender's files, else JSON files of other names that hold camera transforms."""
     usual = folder / "transforms.json"
-    there, splits = (os.path.lexists(path) for path in (usual, folder / SPLITS[0]))  # anything but a file fails later
+    # folders and broken links of these names count, so that reading them reports an error
+    there, splits = (os.path.lexists(path) for path in (usual, folder / SPLITS[0]))
     if there:
         yield _kind_of(usual), usual
     if splits:
@@ -187,15 +188,16 @@ def is_model(folder: Path) -> bool:
 
 
 def models_in(data: Path) -> list[Path]:
-    """List COLMAP models at most three levels below a folder, relative to it, the one to read first: in a usual folder;
-    of models side by side, which COLMAP makes of photographs that it cannot connect, that of most images."""
+    """List COLMAP models at most three levels below a folder, relative to it, by preference: usual folders first; of
+    numbered models side by side (COLMAP writes several if it cannot connect all photographs), those with most images
+    first."""
     found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
     models = [path.relative_to(data) for path in found if is_model(path)]
     models = [model for model in models if not any(part.startswith(".") for part in model.parts)]
 
     def rank(model: Path) -> tuple[int, str, int, str]:
         usual = [Path(name) for name in MODELS]
-        first = model.with_name("0") if model.name.isdigit() else model  # ranks where that would
+        first = model.with_name("0") if model.name.isdigit() else model  # sparse/1 ranks as sparse/0 does
         beside = usual.index(first) if first in usual else len(usual)
         return beside, str(model.parent), -image_count(data / model), str(model)
 
@@ -215,8 +217,8 @@ def image_count(model: Path) -> int:
 
 
 def _photographs_in(folder: Path) -> Path | None:
-    """Choose the folder to search for photographs: this one if it or its `images` holds some, or several
-    subfolders do; else the only subfolder that does. None = no photographs, or captures of their own."""
+    """Choose the folder to search for photographs: this one if it or its `images` holds some, or several subfolders do;
+    else the same within the only subfolder that does. None = no photographs, or subfolders that are captures."""
     if folder_contents.has_photographs(folder) or folder_contents.has_photographs(folder / "images", below=True):
         return folder
     holding = [path for path in folder_contents.folders_in(folder) if folder_contents.has_photographs(path, below=True)]
@@ -226,7 +228,7 @@ def _photographs_in(folder: Path) -> Path | None:
 
 
 def captures_in(folder: Path) -> list[Path]:
-    """List subfolders that are captures of their own: more than one has `images` with photographs."""
+    """List the subfolders whose `images` hold photographs, as captures of their own; empty if there is only one."""
     found = [
         path
         for path in folder_contents.folders_in(folder)

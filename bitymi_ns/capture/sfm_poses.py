@@ -1,5 +1,5 @@
-"""Poses of photographs and videos by structure from motion, and the copy that a training run keeps, so that it goes on
-with them whatever becomes of the photographs."""
+"""Poses of photographs and videos by structure from motion, and the copy that a training run keeps, to be resumed
+with the same poses."""
 
 import json
 import os
@@ -30,12 +30,12 @@ ORIGIN = "origin.json"
 class KeptPoses:
     """Poses in the folder of a run."""
 
-    folder: Path  # with MODEL, the report, and IMAGES if those were made for the training
+    folder: Path  # holds MODEL, the report, and IMAGES if these are upright copies or frames
     origin: Origin  # its photographs are IMAGES if it names no folder
     left_out: Mapping[str, str] = field(default_factory=dict)  # photographs without a pose, and why
 
     def found(self, data: Path) -> Found:
-        """Return the capture at `data`, whatever else lies beside it by now."""
+        """Return the capture at `data` as the run recognized it, whatever lies beside it by now."""
         folder = data if data.is_dir() else data.parent
         return Found(self.origin.kind, folder / self.origin.path, folder)
 
@@ -149,8 +149,9 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
 
 
 def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
-    """Copy a model into an existing folder, with photographs that are copies or frames, as hard links where possible;
-    symbolic links stay. Raises OSError: something cannot be written, or a name in the model leads out of its folder."""
+    """Copy a model into an existing folder, and its photographs if they are upright copies or frames: hard links where
+    possible, symbolic links as they are. Raises OSError: something cannot be written, or a name in the model leads out
+    of its folder."""
     copy_files(source.folder, folder / MODEL)
     if origin.photographs is None:
         for image in source.model.images:

@@ -49,7 +49,7 @@ class Split(NamedTuple):
 
 
 def split_members(split: Split, groups: Sequence[int]) -> Split:
-    """Put each member on the side of its group: views by photograph, photographs by rig frame."""
+    """Extend a split of groups to their members, as of rig frames to photographs, or of photographs to views."""
     sides = [set(side) for side in (split.train, split.held_out)]
     train, held_out = ([i for i, group in enumerate(groups) if group in side] for side in sides)
     return Split(train, held_out, split.rule)
@@ -98,8 +98,8 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
 
 
 def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
-    """Hold out photographs by name, with folders in front if needed. Raises CaptureError: a name matches no photograph,
-    or several."""
+    """Hold out photographs by name, with leading folders where the name alone matches several. Raises CaptureError: a
+    name matches no photograph, or several."""
     held_out = set(find_named(names, wanted, source))
     return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {source}")
 
@@ -130,7 +130,7 @@ def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
 
 
 def read_split_lists(folder: Path) -> NameLists:
-    """Read train_list.txt, test_list.txt and validation_list.txt of nerfstudio's COLMAP parser."""
+    """Read the lists of names of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`."""
     lists = {}
     for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
         path = folder / f"{name}_list.txt"

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 Pose = npt.NDArray[np.float64]
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # [4, 4] between camera frames with OpenCV axes and with OpenGL's
 SPHERICAL_MODEL = "EQUIRECTANGULAR"  # COLMAP camera model of 360-degree pictures; its parameters are width and height
-ASPECT = 0.01  # rounding of the aspect ratio 2 of 360-degree pictures, relative
+ASPECT = 0.01  # relative tolerance of the aspect ratio 2 of 360-degree pictures
 Orientation = Literal["pca", "up", "vertical", "none"]
 
 CONTRADICTED = 0.1
@@ -26,7 +26,7 @@ ones of a room with a box of equal faces 0.20 and 0.27."""
 
 
 class CaptureError(ValueError):
-    """Refuses a capture, photographs or a video: says what is wrong, in which file, and what to do."""
+    """Error in a capture, photographs or a video; the message names the problem, the file and the remedy."""
 
 
 _log = logging.getLogger("bitymi_ns.capture")
@@ -53,7 +53,7 @@ class MapFiles:
     """Files of depth and normals beside a photograph; None = none."""
 
     depth: Path | None = None  # camera z, see `read_depth`
-    confidence: Path | None = None  # of the depth, 0 = low, at most of the size of the depth
+    confidence: Path | None = None  # of the depth, 0 = low; no larger than the depth map
     normal: Path | None = None  # see `read_normal`
 
 
@@ -127,7 +127,7 @@ class SfmSettings:
     """Pairs to match: all (exhaustive), neighbors and similar photographs (sequential), or by number, order and GPS
     positions (auto)."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
-    """Register all cameras at once (global), one after the other (incremental), or fall back to that (auto)."""
+    """Register all cameras at once (global) or one after the other (incremental); auto = global, else incremental."""
     camera_model: Literal[
         "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "EQUIRECTANGULAR"
     ] = "auto"

@@ -44,7 +44,7 @@ def compress(codes: npt.NDArray[np.integer]) -> Compressed:
 
 
 def decompress(view: memoryview, rows: int, sizes: Sequence[int], blocks: int = 0) -> npt.NDArray[np.int64]:
-    """Decompress `compress`: int64 [rows, n], the coefficients of all blocks as rows.
+    """Decompress what `compress` returned to int64 [rows, n]; rows are coefficients x blocks if there are `blocks`.
 
     Raises:
         StreamError: the bytes are damaged or do not match `rows` and `sizes`.
@@ -64,7 +64,7 @@ def decompress(view: memoryview, rows: int, sizes: Sequence[int], blocks: int = 
 
 
 def _others(before: Others, number: npt.NDArray[np.int64], blocks: int) -> Others:
-    """Add the magnitudes of a number [rows] to those before it, at most `_OTHERS`; None for plain rows."""
+    """Add a number's magnitudes [rows] to the sums of those before it, clipped at `_OTHERS`; None without blocks."""
     if not blocks:
         return None
     least = np.clip(np.abs(number), 0, _OTHERS).astype(np.uint8)
@@ -74,7 +74,12 @@ def _others(before: Others, number: npt.NDArray[np.int64], blocks: int) -> Other
 def decompress_planes(
     view: memoryview, rows: int, low: Sequence[int], planes: Sequence[Sequence[int]]
 ) -> npt.NDArray[np.int64]:
-    """Decompress a column [rows, n] of versions 3 and 4: smallest values `low`, sizes of the frames of the byte planes.
+    """Decompress a column [rows, n] of versions 3 and 4, byte plane by byte plane.
+
+    Args:
+        view: a Zstandard frame per byte plane, number after number.
+        low: smallest value of each number.
+        planes: bytes of each number's frames, least significant plane first.
 
     Raises:
         StreamError: a frame is damaged or its size does not match `rows`.

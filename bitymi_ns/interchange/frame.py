@@ -72,8 +72,8 @@ def to_capture(place: WorldEntry) -> Similarity:
 
 
 def up_of(place: WorldEntry, to: Similarity | None) -> Tensor:
-    """Compute the up direction [3] in the scene's frame, or the nearest axis of another frame, so that a rotation to +y
-    only permutes the coordinates of that frame."""
+    """Compute the up direction [3] in the scene's frame, or with `to` the nearest axis of the new frame, so that a
+    rotation to +y only permutes and negates its coordinates."""
     up = torch.tensor(place.up or _UP, dtype=torch.float64)
     if to is None:
         return up

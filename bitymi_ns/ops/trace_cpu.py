@@ -58,7 +58,7 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 def select(
     layout: Layout, numbers: dict[str, Tensor], keep: Tensor, width: int, height: int
 ) -> tuple[Layout, dict[str, Tensor]]:
-    """Select fragments: their layout, and their numbers.
+    """Select fragments of a list; returns their layout and numbers, as `find_fragments` does.
 
     Args:
         layout, numbers: of a list of F fragments.

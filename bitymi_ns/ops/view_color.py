@@ -74,7 +74,7 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
 
 
 def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
-    """Check the lean view colours of n surfels; waits for a device.
+    """Check the lean view colours of n surfels; synchronises with a CUDA device.
 
     Raises:
         ValueError: wrong shape or dtype, a span outside the terms, or harmonics that end within a degree.

@@ -19,9 +19,9 @@ POINTS = 6000  # maximum number of points compared
 HIDING = 100_000  # maximum number of points that may occlude them
 OBSERVATIONS = 1_200_000  # maximum of points times photographs
 SWEEPS = 10  # passes of the median polish
-DARKEST, BRIGHTEST = 0.03, 0.97  # range of channels used: beyond it noise, rounding and clipping dominate
+DARKEST, BRIGHTEST = 0.03, 0.97  # range of channel values used: beyond, noise, rounding and clipping dominate
 FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
-CELL = 2.0  # side of the cells of the occlusion test, in mean distances of the points in the image
+CELL = 2.0  # side of the cells of the occlusion test, in mean spacings of the projected points
 HIDDEN = 0.05  # an occluding point is nearer by this share of its depth, or of twice the view's depth range if less
 FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
@@ -31,8 +31,8 @@ class ExposureGains(NamedTuple):
 
     log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
     points: Tensor  # [V] int64, number of points used for each photograph
-    # share by which gains reduce the median deviation of log colours from their point's median, measured on points not
-    # used for the gains; NaN: too few points, or no deviation
+    # share by which gains from half of the points reduce the median deviation of log colours from their point's median,
+    # measured on the other half; NaN: too few points, or no deviation
     explained: float
 
 
@@ -87,7 +87,7 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
 
 
 def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
-    """Read pixels [C, ...] of an image [H, W, ...] at positions in a camera's image, whose size may differ."""
+    """Read the pixels [P, ...] of an image [H, W, ...] at P positions of a camera, whose image size may differ."""
     at = (
         (along.nan_to_num(0.0) * size / full).long().clamp(0, size - 1).to(image.device)
         for along, size, full in zip((y, x), image.shape[:2], (camera.height, camera.width), strict=True)

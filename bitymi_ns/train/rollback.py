@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from bitymi_ns.train.poses import Poses
 
 WORSE = 1.25
-"""A window is bad if its mean loss is this many times the best window's, or early in the run the blank loss."""
+"""Ratio to the best window's mean loss, or early in the run to the blank loss, above which a window is bad."""
 RISE = 0.1
 """Share of the blank loss by which a bad window must also exceed the best one: losses near 0 may double."""
 EARLY = 0.1  # share of the run in which views may be slightly worse than blank ones
@@ -86,7 +86,7 @@ class RollbackGuard:
         self._states: list[tuple[int, dict[str, Any]]] = []  # (step, state); the older one is known to be good
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a resumed run, without the states to restore: it rolls back to its resume at most."""
+        """Return the state for a resumed run, without captured states: it cannot roll back to before it resumed."""
         return {
             "factor": self.factor,
             "rollbacks": self.rollbacks,
@@ -170,7 +170,7 @@ class RollbackGuard:
             Counts of what was done, by name.
 
         Raises:
-            TrainingDiverged: nothing can be restored, or the limit of rollbacks is reached.
+            TrainingDiverged: no parameter is broken, rollbacks are disabled or used up, or no state was captured.
         """
         cause = describe_broken(self.scene)
         if not self.on or not cause:
@@ -186,10 +186,10 @@ class RollbackGuard:
                 the CPU in each step.
 
         Returns:
-            Counts of what was done, by name; empty if nothing was.
+            Counts of what was done, by name; empty if nothing was, or rollbacks are disabled.
 
         Raises:
-            TrainingDiverged: the limit of rollbacks is reached, or rollbacks are disabled.
+            TrainingDiverged: the limit of rollbacks is reached, or no state was captured.
         """
         if not self.on:
             return {}
@@ -283,7 +283,7 @@ class RollbackGuard:
         }
 
     def _restore(self, state: Mapping[str, Any]) -> None:
-        # new Parameters: a live graph keeps the size of the old ones
+        # new Parameters, as a live autograd graph relies on the shapes of the old ones
         surfels = self.scene.surfels
         rows = {name: state["scene"][f"surfels.{name}"] for name in surfels.keys()}
         none = torch.zeros(0, dtype=torch.int64, device=surfels["means"].device)

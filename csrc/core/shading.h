@@ -17,8 +17,8 @@ template <class S> BT_HD Vec3<S> shaded(Vec3<S> base, Vec3<S> residual) {
   return {shaded(base.x, residual.x), shaded(base.y, residual.y), shaded(base.z, residual.z)};
 }
 
-// Computes the gradient of the residual: it passes where the outer ReLU is open; that of the view colour where both
-// are.
+// Gradients through the ReLUs: the residual's passes where the outer one is open, the view colour's, from the sum of
+// the residual's, where the inner one is open too.
 template <class T> BT_HD T residual_gradient(T color, T dcolor) { return select(color > T(0.0f), dcolor, T(0.0f)); }
 template <class S> BT_HD Vec3<S> residual_gradient(Vec3<S> color, Vec3<S> dcolor) {
   return {residual_gradient(color.x, dcolor.x), residual_gradient(color.y, dcolor.y),

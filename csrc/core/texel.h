@@ -8,8 +8,8 @@
 
 namespace bt {
 
-// Computes the position along one axis of a tile of r texels, clamped to the outer texel centres: texel floor(x), its
-// neighbour min(floor(x) + 1, r - 1), and the fraction is the neighbour's weight.
+// Position x of u among r texels along an axis of a tile, clamped to the outer texel centres. A bilinear fetch reads
+// texels floor(x) and min(floor(x) + 1, r - 1); the fraction of x is the weight of the second.
 template <class S, class T> BT_HD T texel_position(T u, int r, S extent) {
   const T x = (u + T(extent)) * T(S(r) / (S(2) * extent)) - T(S(0.5));
   return clamp_(x, T(S(0)), T(S(r - 1)));
@@ -20,21 +20,22 @@ template <class S, class T> BT_HD T texel_position_scaled(T u, S span, S k) {
   return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
 }
 
-// Levels of a tile: 2 x 2 texels of a level form one of the next, if they lie on the grid of the page.
+// Mip levels of a tile: a level has means of 2 x 2 texels of the one before. It exists if the tile's position and sides
+// are divisible by 2^level, so that these are also 2 x 2 texels of the page.
 constexpr int kTileLevels = 3;
 BT_HD bool has_level(const int32_t* tile, int level) {  // x, y, page, r_u, r_v
   return ((tile[0] | tile[1] | tile[3] | tile[4]) & ((1 << level) - 1)) == 0;
 }
-// Selects the level with about one texel per pixel from a row of geom (core/surfel.h): the geometric mean over the
-// axes. Not coarser than the view relative to the photographs: near their size the texels were trained as they are.
-// kTileLevels if only a constant is left.
+// Mip level with about one texel per pixel, by area, from a row g of geom (core/surfel.h). Halved at most as often as
+// the view relative to the photographs, at whose size texels were trained. kTileLevels: at most 2 texels a side would
+// be left, and the tile's mean replaces them.
 template <class S> BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
   const S k = S(0.5) / (extent * g[kW0]);  // texels per pixel along the gradient of u and v, squared
   const S u = g[kU1] * g[kU1] + g[kU2] * g[kU2], v = g[kV1] * g[kV1] + g[kV2] * g[kV2];
   const S area = sqrt_(u * v) * k * k * S(r_u) * S(r_v);  // texels per pixel, by area
   const S most = S(1) / (photo_pixel * photo_pixel);
   int level = 0, side = max_(r_u, r_v);
-  // midway between two levels, 4^l sqrt(4) / 2
+  // geometric mean of 4^l and 4^(l + 1) texels per pixel, those of two levels
   for (S size = S(2); level < kTileLevels && area > size && most >= size; size *= S(4)) ++level, side /= 2;
   return level && side <= 2 ? kTileLevels : min_(level, kTileLevels - 1);
 }
@@ -51,14 +52,14 @@ template <class S, class T> BT_HD TexelAxis<T> texel_axis(T u, int r, S extent) 
   const MaskOf<T> inside = (x > T(S(0))) & (x < T(S(r - 1)));
   return {first, x - first, inside};
 }
-// Index steps to the next texels along u and v (rows lie along v).
+// Index steps to the next texel along u and along v; a row of texels runs along u.
 struct TexelSteps {
   int right, down;
   BT_HD explicit TexelSteps(const int32_t* size) : right(size[0] > 1 ? 1 : 0), down(size[1] > 1 ? size[0] : 0) {}
 };
 
-// Weights of the bilinear fetch from four texels t (three channels or a SIMD vector), rows along v, and its gradient
-// along each axis, per texel: it is linear between texel centres.
+// Bilinear fetch from four texels t (three channels or a SIMD vector), two rows along u: its weights, value, and slopes
+// along u and v per texel.
 template <class S> BT_HD void texel_weights(S fx, S fy, S* weight) {
   weight[0] = (S(1) - fx) * (S(1) - fy), weight[1] = fx * (S(1) - fy), weight[2] = (S(1) - fx) * fy;
   weight[3] = fx * fy;
@@ -102,8 +103,8 @@ template <class S> BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* 
 template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
 }
-// Gradient of the fetch along u and v from its four texels: 0 beyond the outer texel centres; at a centre between them,
-// where the slope jumps, that on the side of larger coordinates.
+// Slopes of the fetch along u and v, from its four texels: 0 beyond the outer texel centres; at an inner centre, where
+// the slope jumps, that on the side of larger coordinates.
 template <class S> struct TexelSlopes {
   Vec3<S> u, v;
 };
@@ -115,7 +116,7 @@ BT_HD TexelSlopes<S> texel_slopes(const Vec3<S>* t, const TexelCorners<S>& c, co
   return s;
 }
 
-// Returns a texel after a step along its gradient g.
+// Texel after a step of gradient descent, -rate share g.
 template <class V, class S> BT_HD V texel_step(V texel, V g, S rate, S share) { return texel + -rate * share * g; }
 
 }  // namespace bt

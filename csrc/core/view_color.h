@@ -17,7 +17,7 @@ template <class S> BT_HD Unit<S> view_direction(const S* mean, const double* cen
 
 constexpr const char* kViewColorNames[] = {SphericalVoronoi::kName, SphericalHarmonics::kName, SphericalBeta::kName,
                                            SphericalGaussians::kName};
-// Calls f with the struct of a kind, an index into that list.
+// Call f with the struct of a kind, an index into kViewColorNames, and return its result.
 #if defined(__CUDACC__)
 #pragma nv_exec_check_disable  // f may be for host or device only
 #endif
@@ -37,7 +37,8 @@ BT_HD ViewColorWidths view_color_widths(int kind, int K) {
   return for_view_color(kind, [=](auto view_color) { return view_color.widths(K); });
 }
 
-// Parameters of all surfels. `terms` = sites, coefficients (with dc) or lobes.
+// Parameters of n surfels: a, b and c are [n, width] (view_color_widths). `terms`: number of sites, coefficients (with
+// dc) or lobes.
 template <class S> struct ViewColorArrays {
   int kind, terms;
   S *a, *b, *c;

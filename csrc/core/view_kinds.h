@@ -195,7 +195,7 @@ struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
   }
 };
 
-// Softplus with slope 10 ln 2, which is 0.1 at 0 (lobe colours of Deformable Beta Splatting).
+// Softplus log(1 + exp(a x)) / a with a = 10 ln 2, so that it is 0.1 at 0 (lobe colours of Deformable Beta Splatting).
 constexpr double kLobeSlope = 6.931471805599453;
 template <class S> BT_HD S lobe_softplus(S x) {
   const S a = S(kLobeSlope) * x;
@@ -203,7 +203,7 @@ template <class S> BT_HD S lobe_softplus(S x) {
   return (big + log_(S(1) + exp_(a > S(0) ? -a : a))) / S(kLobeSlope);
 }
 
-// softplus(rgb) max(0, d . mu)^(4 exp(b)); a lobe is r, g, b, theta, phi, b
+// Lobe of Spherical Beta, softplus(rgb) max(0, d . mu(theta, phi))^(4 exp(b)): six numbers rgb (3), theta, phi, b.
 template <class S> struct BetaLobe {
   Vec3<S> mu, color;
   S st, ct, sp, cp, cosine, power, value;
@@ -247,7 +247,7 @@ struct SphericalBeta : StoredWhole<SphericalBeta> {
       g[2] = l.value * dc.z * sigmoid(S(kLobeSlope) * lobe[2]);
       const S dvalue = dot(dc, l.color);
       const bool lit = l.cosine > S(0);
-      // value / cosine stays finite: the power is positive, so value vanishes with the cosine
+      // clamped, as value / cosine diverges at 0 for powers below 1
       const S dcos = lit ? dvalue * l.power * l.value / max_(l.cosine, S(1e-6)) : S(0);
       g[5] = lit && lobe[5] < S(kLogPowerMax) ? dvalue * l.value * log_(l.cosine) * l.power : S(0);
       const Vec3<S> dmu = dcos * d;

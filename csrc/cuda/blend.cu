@@ -7,7 +7,7 @@
 // Backward, kRunLanes lanes take a pair's fragments in turn, with the tile's part of dimage in shared memory. A pair's
 // contribution to its surfel goes to its slot, so only sums of texels depend on the order.
 //
-// Bytes per fragment of surfels alone; with texels on 4 of 12 bytes more; and with a residual per fragment:
+// Bytes per fragment: surfels alone; with texels, besides fetching four of 12 bytes each; with a residual per fragment:
 //             alone   with texels   with residuals
 //   forward     8         16              20
 //   backward   12         24              36
@@ -106,7 +106,7 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
   Adder<S, kExact> texel_sums = {};
   if constexpr (kTexels) texel_sums = adder<kExact>(out.texels, exact);
   const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
-  // Runs of a warp take turns together.
+  // Both runs of a warp loop equally often, as its shuffles need all lanes.
   for (int64_t k = first + worker; k - worker % 2 < end; k += kWorkers) {
     const bool some = k < end;
     const int64_t begin = some ? p.offsets[k] : 0;

@@ -11,7 +11,7 @@ namespace bt::cuda {
 
 namespace {
 constexpr int kThreads = 256;
-constexpr int kMostSums = 1024, kLossSums = 3;  // blocks; of l1, right and count
+constexpr int kMostSums = 1024, kLossSums = 3;  // most blocks with sums; their sums of l1, right and count
 
 template <class S> BT_HD S sign_(S x) {
   return x > S(0) ? S(1) : x < S(0) ? S(-1) : x;  // keeps 0 and NaN
@@ -214,7 +214,7 @@ template <class S> __global__ void __launch_bounds__(kThreads) adam_kernel(AdamR
   }
 }
 
-// One block: first the row, then column after column of the table.
+// One block: the Adam step of the row, then, with settle, the projection of the table's columns one after another.
 template <class S> __global__ void __launch_bounds__(kThreads) exposure_kernel(LearnExposure<S> a) {
   __shared__ double shared[kThreads];
   const int thread = int(threadIdx.x);

@@ -50,9 +50,9 @@ template <class S> struct ViewColorBackward {
   }
 };
 
-// Takes an Adam step on row `number` of the photographs' corrections, table [photographs, width], by the gradient
-// [width] with respect to the correction (gains, not log gains). Unless settle is 0, makes all rows admissible as
-// `train.exposure.settled`.
+// Adam step number `step`, from 1, on row `number` of the photographs' corrections, table [photographs, width], by the
+// gradient [width] with respect to the correction (gains, not log gains). Unless settle is 0, all rows are then
+// projected to admissible ones, as by `train.exposure.settled`.
 template <class S> struct LearnExposure {
   int64_t photographs, number;
   int width, settle;
@@ -79,7 +79,8 @@ template <class S> struct LearnExposure {
   }
 };
 
-// Images [height, width, channels]; writes value [1] and, unless null, da.
+// Mean SSIM of images a and b [height, width, channels] to value [1], and its gradient with respect to a to da unless
+// that is null.
 template <class S> struct Ssim {
   int height, width, channels;
   const S *a, *b;

@@ -10,7 +10,7 @@ namespace bt {
 constexpr int kCosines = 8;       // texels along a side of the largest block
 constexpr int kMostChannels = 3;  // of a texel
 
-// All blocks of one size, and what codes them: integer multiples of steps.
+// All blocks of one size, and their transform, whose coefficients are integer multiples of steps.
 template <class S> struct CosineBlocks {
   int64_t texels, tiles, blocks;
   int height, width, channels;  // of a block, at most kCosines each
@@ -20,7 +20,7 @@ template <class S> struct CosineBlocks {
   const S *down, *across;       // [height, height], [width, width] cosine transforms: row k is frequency k
   const int64_t* order;         // [height * width] stored order of coefficients, k_v width + k_u
   const int64_t* tile;          // [blocks]
-  const int64_t* rows;          // [blocks, height, width] of the texels
+  const int64_t* rows;          // [blocks, height, width] rows of the texels in `values`
 
   template <class R> void fields(R& r) {
     r.numbers("height", height, "width", width, "channels", channels);

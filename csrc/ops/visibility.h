@@ -72,8 +72,9 @@ template <class S> struct View {
   }
 };
 
-// Writes dgeom [n, kGeom] and absgrad [n, 2]. dweight, duv, ddepth may be null (zero). dsigma and partial are working
-// memory; the sums of a pair: columns 0 to kBeta of geom, two absolute gradients, one unused, kArea.
+// Writes dgeom [n, kGeom] and absgrad [n, 2]. dweight, duv, ddepth may be null (zero); rim as in fragment_vjp
+// (core/kernel.h). dsigma and partial are working memory: a row of partial has the sums of a pair (a surfel in a screen
+// tile), gradients of columns 0 to kBeta of geom, two absolute gradients, one unused, and the gradient of kArea.
 constexpr int kTraceSums = 16;
 template <class S, class Layout> struct TraceBackward {
   View<S> view;

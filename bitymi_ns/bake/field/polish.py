@@ -24,7 +24,7 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
 
 MEANS = (1.6e-4, 1.6e-6)
-"""Rates of the positions in shares of the extent, as polishing was measured with: steps in pixels have not been."""
+"""First and last learning rates of positions, in scene extents: polishing was measured with these, not in pixels."""
 
 
 @dataclass
@@ -48,7 +48,7 @@ def _polish_run(
     device: torch.device | str,
     progress: Progress,
 ) -> Trainer:
-    """Begin a training run that is all texel stage, without what changes the number of surfels."""
+    """Set up a training run that consists of the texel stage alone and keeps the number of surfels."""
     texels = TexelList(baked, device)
     drawn, tiles = texels.scene, texels.tiles
     share = 1.0 / (texels.coverage(views, progress)[:, 0] + options.prior)
@@ -110,14 +110,13 @@ def polish_scene(
     Args:
         baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
-        background: [3] colour behind the scene, but for steps on views behind which it changes (`train.background`).
+        background: [3] colour behind the scene, except in training where `train.background` changes it by step.
         train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
             a step is not finite.
         eval_views: views of which the gain is stated; they decide nothing.
 
     Returns:
-        a new bake with `statistics.polish`; `baked` itself without change where there are fewer than 4
-        views.
+        a new bake with `statistics.polish`; with fewer than 4 views, `baked` with 0 steps in it.
 
     Raises:
         ValueError: there is no atlas, the view colours are reduced, or an option is out of range.
@@ -146,7 +145,7 @@ def polish_scene(
 def _optimise(
     run: Trainer, validation: Sequence[View], options: PolishOptions, guard: GuardConfig, progress: Progress
 ) -> EarlyStopping[dict[str, Tensor]]:
-    """Find the state that shows the validation views best; also returns the evaluations."""
+    """Train; return the state that shows the validation views best, and the evaluations."""
 
     def state() -> dict[str, Tensor]:
         return {name: value.detach().clone() for name, value in run.scene.state_dict().items()}

@@ -1,4 +1,4 @@
-"""Find SIFT features of all photographs, in COLMAP's database."""
+"""Extract SIFT features of all photographs into COLMAP's database."""
 
 from pathlib import Path
 
@@ -7,20 +7,20 @@ import pycolmap
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
 from bitymi_ns.capture.types import SPHERICAL_MODEL
 
-SMALL = 1000  # double photographs with fewer pixels along the longer side; larger ones have enough features
+SMALL = 1000  # photographs with a shorter longer side, pixels, are doubled; larger ones have enough features
 SPHERICAL_SCALE = 2
-"""Factor on these sizes for 360-degree pictures, whose details are small: with half the features, their positions were
-wrong by a metre among perspective photographs."""
+"""Factor on `SMALL` and the largest image size for 360-degree pictures, whose details are small: with half the
+features, their camera positions were wrong by a metre among perspective photographs."""
 
 
 def extract(job: Job, database: Path, tell: StageProgress) -> None:
-    """Find features of photographs without any yet."""
+    """Extract features of the photographs that have none in the database."""
     total = len(job.order)
     tell("finding features", 0, total, counts="keypoints")
     ids = zip(job.cameras, camera_ids(job, database), strict=True)
     groups = [(group, _reader(job, group, camera_id)) for group, camera_id in ids]
     single = {"camera_mode": pycolmap.CameraMode.SINGLE}
-    for group, reader in groups:  # number photographs in an order that threads do not change
+    for group, reader in groups:  # before extraction, whose threads would number the photographs in any order
         pycolmap.import_images(database, job.images, image_names=group.names, options=reader, **single)
     for group, reader in groups:
         options = {"reader_options": reader, "extraction_options": _extraction(job, group), **single}
@@ -30,7 +30,7 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
 
 
 def camera_ids(job: Job, database: Path) -> list[int]:
-    """Return the groups' cameras in the database; write those that an earlier run lacks."""
+    """Write the groups' cameras that the database lacks after an earlier run, and return the ids of all."""
     with pycolmap.Database.open(database) as opened:
         for group in job.cameras[opened.num_cameras() :]:
             camera = group.camera.colmap

@@ -1,4 +1,4 @@
-"""Run COLMAP in its own process, which Ctrl-C ends at once and which alone ends if COLMAP aborts."""
+"""Run COLMAP in a process of its own: Ctrl-C can end it at once, and an abort of COLMAP ends nothing else."""
 
 import json
 import os
@@ -60,7 +60,8 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
 def _watched(database: Path, table: str, progress: Progress, stage: str, total: int) -> Iterator[None]:
     """Report the rows of a table of COLMAP's database while COLMAP fills it.
 
-    From this process: COLMAP's copy of SQLite and Python's in one process would undo each other's locks on a file.
+    Rows are counted in this process: COLMAP's copy of SQLite and Python's in one process would release each other's
+    file locks.
     """
     ended = threading.Event()
 
@@ -90,7 +91,7 @@ def rows(database: Path, table: str) -> int:
 
 
 def delete_work(work: Path, *folders: str) -> None:
-    """Remove features and matches, and these folders."""
+    """Delete features, matches and pairs from a work folder, and its subfolders `folders`."""
     for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", PAIRS):
         with suppress(OSError):
             (work / name).unlink()

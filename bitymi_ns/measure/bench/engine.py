@@ -1,5 +1,5 @@
-"""Execution of a matrix's missing cells. Several processes, on different GPUs or machines, may share a folder: runs
-locked by another process are skipped."""
+"""Execution of a benchmark matrix's missing cells. Several processes, on different GPUs or machines, may share a
+folder: runs locked by another process are skipped."""
 
 import shutil
 import statistics
@@ -222,8 +222,8 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
 
 
 def time_left(stages: Iterable[CellSpec], cells: Cells) -> str:
-    """Estimate the remaining time from the mean of finished cells of the same kind, scene and number of steps, or else
-    of the same kind; empty if a kind has none."""
+    """Describe the estimated time left for `stages`, in words that end a message: each cell takes the mean of finished
+    cells of its kind, scene and number of steps, else of its kind; empty if a kind has none."""
     known: dict[tuple, list[float]] = {}
     for cell in cells:
         key, seconds = cell["key"], cell.get("made", {}).get("seconds")

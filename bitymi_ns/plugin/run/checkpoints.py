@@ -17,17 +17,17 @@ from bitymi_ns.trust import json_of
 
 STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")
-"""Scene options that may differ from a checkpoint's: they change how parameters are drawn or learned alone."""
+"""Scene options that may differ from a checkpoint's: they change only how parameters are drawn or learned."""
 
 
 def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
     """Write a checkpoint; a crash or a full disk leaves the previous ones as they were. The unfinished file lies in
-    `scratch`, of the same file system: nerfstudio takes any name in the folder for a checkpoint."""
+    `scratch`, a folder on the same file system: nerfstudio takes any file beside the checkpoints for one."""
     try:
         with complete_file(path, scratch) as file:
             torch.save(state, file)
     except (OSError, RuntimeError) as error:
-        # torch writes an archive's end after a failed write, and reports only that it does not fit
+        # after a failed write torch still ends its archive, and reports that: the disk's error is in its context
         behind: BaseException | None = error
         while behind is not None and not isinstance(behind, OSError):
             behind = behind.__context__
@@ -57,7 +57,7 @@ def path_of(folder: Path, step: int) -> Path:
 
 
 def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
-    """Read a checkpoint of a scene of this kind."""
+    """Read a checkpoint, check that it fits the options of `scene`, and warn of numbers that are not finite."""
     if path.is_dir():
         fail(f"{path} is a folder: give one of the files step-*.ckpt with --load-checkpoint, or --load-dir")
     if not path.is_file():
@@ -97,7 +97,7 @@ def _read(path: Path) -> Any:
 
 
 def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
-    """Stop at parameters of another method, version or preset, in a sound file."""
+    """Fail on parameters of another method, a newer version, or scene options that differ beyond `MAY_DIFFER`."""
     extra = parameters.get("_model." + EXTRA_STATE) if isinstance(parameters, dict) else None
     if not isinstance(extra, dict) or f"{SURFELS}means" not in parameters:
         fail(f"{path} is not a checkpoint of this method: it holds no surfels. Load it with the method it is from.")

@@ -1,7 +1,7 @@
-"""Render our scenes in `ns-render`: films and frames without a program ffmpeg, options checked before loading a scene.
+"""Rendering in `ns-render`: films and frames without the ffmpeg program, options checked before a scene is loaded.
 
-nerfstudio's script reads a camera path, or makes one of the capture's cameras, and calls a function that renders and
-writes. `hooks.patch_render` replaces it by those of this module.
+nerfstudio's script reads a camera path, or makes one from the capture's cameras, and calls a function that renders and
+writes. `hooks.patch_render` replaces its functions by those of this module.
 """
 
 import math
@@ -28,10 +28,10 @@ from bitymi_ns.train.views import spread
 
 TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
 """nerfstudio's script classes that render along a path."""
-OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")  # outputs of all our scenes
+OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")  # outputs of every surfel scene
 WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs drawn without maps
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
-"""Frames, their size, and the share left out at either end, for the range of a film's depth colours."""
+"""Sampled frames, their longer side in pixels, and the share of depths clipped at either end: a film's depth range."""
 TURNS = 2  # of a spiral
 FAINT = 1 / 255  # accumulation of a pixel that shows nothing
 OPTION = " (--output-path)."
@@ -118,7 +118,7 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
         )
     path = stock(cameras=cameras, **options)
     points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
-    along = stock(cameras=points, **options)  # principal points for focal lengths
+    along = stock(cameras=points, **options)  # principal points in the fields of focal lengths
     path.cx, path.cy = along.fx, along.fy
     for name in ("width", "height"):
         setattr(path, name, torch.full_like(getattr(path, name), int(getattr(cameras, name)[0])))
@@ -134,9 +134,8 @@ def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
 
 @torch.no_grad()
 def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cameras:
-    """Make cameras on a spiral around one, turned to the point in the middle of its picture, `radius` units of the
-    scene along its axes; nerfstudio's rolls, as it takes the camera's axis in the world for the upward one in the
-    camera."""
+    """Make cameras on a spiral around `start`, `radius` scene units along its axes, all facing the point at the median
+    depth of its image's centre. nerfstudio's spiral rolls, as it takes a world axis for the camera's up axis."""
     camera = to_camera(start, model.device).within(DEPTH_SIDE)
     outputs = model.outputs_of(camera, maps=True)
     y, x = camera.height // 3, camera.width // 3
@@ -212,7 +211,7 @@ def _picture(
 
 
 def _depth_planes(model: SurfelModel, views: Sequence[Any], command: Any) -> dict[str, float]:
-    """Return the colours' nearest and farthest depth: the options', else the whole film's, to mean the same in it."""
+    """Return the depth range of the colours: from the options, else common to all frames, so that colours compare."""
     seen = []
     for i in spread(len(views), DEPTH_VIEWS):
         outputs = model.outputs_of(views[i].within(DEPTH_SIDE), maps=True)

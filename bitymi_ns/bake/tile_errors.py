@@ -23,7 +23,7 @@ _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is eva
 
 def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
     """Compute `weighted_rms` as a view shows it: difference x weight, averaged over a pixel's `cells` [n, 2] first."""
-    return weighted_rms(averaged(difference * weight[:, None], cells), (weight > 0).float())
+    return weighted_rms(moving_average(difference * weight[:, None], cells), (weight > 0).float())
 
 
 @torch.no_grad()
@@ -78,8 +78,8 @@ def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) 
     return torch.minimum(covered.clamp(min=1.0), sides)
 
 
-def averaged(values: Tensor, cells: Tensor) -> Tensor:
-    """Average values over a rectangle about every cell: a moving average whose width differs by tile.
+def moving_average(values: Tensor, cells: Tensor) -> Tensor:
+    """Average values over a rectangle about every cell, whose size differs by tile.
 
     A rectangle that would reach beyond the grid is moved into it. With rectangles of one cell, values stay as they are.
 

@@ -135,10 +135,8 @@ def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None
     """Report the pictures of a capture that are not `used`, except folders of copies smaller by `downscale`, such as
     `images_2`."""
     named = frozenset(Path(os.path.normpath(path)) for path in used if path is not None)
-    others = passed_over(Path(os.path.normpath(folder)), named)
-    if downscale is not None:
-        others = [each for each in others if f"_{downscale} (" not in each]
-    if others:
+    copies = None if downscale is None else f"_{downscale}"
+    if others := passed_over(Path(os.path.normpath(folder)), named, copies):
         say(f"Not taken for photographs in {folder}: {listed(others, most=12)}.")
 
 

@@ -144,13 +144,16 @@ def _skipped(parent: Path, below: Collection[str]) -> dict[str, str]:
     return found
 
 
-def passed_over(folder: Path, used: Collection[Path] | None = None) -> list[str]:
+def passed_over(folder: Path, used: Collection[Path] | None = None, copies: str | None = None) -> list[str]:
     """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out; given
-    the `used` files, also other photographs in their folders and one level below."""
+    the `used` files, also other photographs in their folders and one level below. Folders whose names end in `copies`
+    are left out: smaller copies, such as `images_2`."""
     found, holding = [], {above for path in used or () for above in path.parents}
     for parent, below, names in os.walk(folder):
         skipped = _skipped(Path(parent), below)
         for name, what in skipped.items():
+            if copies is not None and name.endswith(copies):
+                continue
             if what not in ("", "hidden") and (count := _pictures(Path(parent, name), used or ())):
                 found.append(f"{Path(parent, name).relative_to(folder)} ({what}: {count})")
         searched = used is None or Path(parent) in holding  # a folder of captures may hold a whole disk

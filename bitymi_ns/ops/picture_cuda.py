@@ -122,7 +122,7 @@ def picture_losses(
 
 
 @torch.no_grad()
-def note_centers(
+def accumulate_statistics(
     projection: Projection,
     width: int,
     height: int,
@@ -142,9 +142,9 @@ def note_centers(
         RuntimeError: the tensors are not on a CUDA device.
     """
     radii = projection.radii
-    require("note_centers", "cuda", radii.device, "call `Strategy.accumulate`")
+    require("accumulate_statistics", "cuda", radii.device, "call `Strategy.accumulate`")
     grads = {"grad": projection.mean2d_grad, "absgrad": projection.mean2d_absgrad}
-    kernel("note_centers", radii)(
+    kernel("accumulate_statistics", radii)(
         radii=radii,
         **{name: None if grad is None else dense(grad, radii) for name, grad in grads.items()},
         width=width,

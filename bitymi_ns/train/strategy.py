@@ -24,7 +24,7 @@ from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import ALPHA_MIN
-from bitymi_ns.ops.picture_cuda import note_centers
+from bitymi_ns.ops.picture_cuda import accumulate_statistics
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
@@ -101,11 +101,11 @@ class Strategy:
     def accumulate(self, *projections: Projection) -> None:
         """Add the statistics of a step's training views, over all processes; call it after the backward passes."""
         if self.processes.views == 1:
-            self._note(*projections)
+            self._accumulate_view(*projections)
             return
         before, self.statistics = self.statistics, torch.zeros(len(STATISTICS), 0)
         for projection in projections:
-            self._note(projection)
+            self._accumulate_view(projection)
         self.processes.sum(self.statistics[:3])
         self.processes.maximum(self.statistics[3])
         if before.shape[1] > 0:
@@ -114,7 +114,7 @@ class Strategy:
             self.statistics[3] = torch.maximum(before[3], self.statistics[3])
 
     @torch.no_grad()
-    def _note(self, projection: Projection) -> None:
+    def _accumulate_view(self, projection: Projection) -> None:
         """Add the statistics of one training view."""
         n, device = len(projection.radii), projection.radii.device
         if self.statistics.shape[1] == 0:
@@ -125,7 +125,7 @@ class Strategy:
         grad_sum, abs_grad_sum, visible_count, max_radius = self.statistics
         height, width = projection.camera.height, projection.camera.width
         if cuda_backend(device):
-            note_centers(projection, width, height, grad_sum, abs_grad_sum, visible_count, max_radius)
+            accumulate_statistics(projection, width, height, grad_sum, abs_grad_sum, visible_count, max_radius)
             return
         visible = projection.visible
         for total, gradient in ((grad_sum, projection.mean2d_grad), (abs_grad_sum, projection.mean2d_absgrad)):

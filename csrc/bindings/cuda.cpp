@@ -81,7 +81,7 @@ template <class S> void bind_operations(nb::module_& m) {
   bind_operation(m, name("rasterize_backward"), &rasterize_backward<S>);
   bind_operation(m, name("picture_loss"), &picture_loss<S>);
   bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
-  bind_operation(m, name("note_centers"), &note_centers<S>);
+  bind_operation(m, name("accumulate_statistics"), &accumulate_statistics<S>);
   bind_adam<S>(m, name("adam"));
   bind_training_view<S>(m);
   // bytes of working memory

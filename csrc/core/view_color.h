@@ -51,7 +51,7 @@ template <class S> struct ViewColorArrays {
   }
   template <class R> void arrays(R& r, int64_t n, const char* name_a, const char* name_b, const char* name_c) {
     const int least = for_view_color(kind, [](auto view_color) { return view_color.kLeastTerms; });
-    if (terms < least || terms > kMaxTerms) r.refuse("a view colour has 1 to 32 terms");
+    if (terms < least || terms > kMaxTerms) r.refuse("a view colour has 1 to 32 terms, of sb and sg 0 to 32");
     const ViewColorWidths w = view_color_widths(kind, terms);
     r.array(name_a, a, w.a * n);
     r.array(name_b, b, w.b * n);

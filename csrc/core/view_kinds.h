@@ -196,11 +196,11 @@ struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
 };
 
 // Softplus log(1 + exp(a x)) / a with a = 10 ln 2, so that it is 0.1 at 0 (lobe colours of Deformable Beta Splatting).
-constexpr double kLobeSlope = 6.931471805599453;
+constexpr double kLobeSharpness = 6.931471805599453;
 template <class S> BT_HD S lobe_softplus(S x) {
-  const S a = S(kLobeSlope) * x;
+  const S a = S(kLobeSharpness) * x;
   const S big = a > S(0) ? a : S(0);
-  return (big + log_(S(1) + exp_(a > S(0) ? -a : a))) / S(kLobeSlope);
+  return (big + log_(S(1) + exp_(a > S(0) ? -a : a))) / S(kLobeSharpness);
 }
 
 // Lobe of Spherical Beta, softplus(rgb) max(0, d . mu(theta, phi))^(4 exp(b)): six numbers rgb (3), theta, phi, b.
@@ -242,9 +242,9 @@ struct SphericalBeta : StoredWhole<SphericalBeta> {
       const S* lobe = lobes + 6 * k;
       S* g = dlobes + 6 * k;
       const BetaLobe<S> l = beta_lobe(lobe, d);
-      g[0] = l.value * dc.x * sigmoid(S(kLobeSlope) * lobe[0]);
-      g[1] = l.value * dc.y * sigmoid(S(kLobeSlope) * lobe[1]);
-      g[2] = l.value * dc.z * sigmoid(S(kLobeSlope) * lobe[2]);
+      g[0] = l.value * dc.x * sigmoid(S(kLobeSharpness) * lobe[0]);
+      g[1] = l.value * dc.y * sigmoid(S(kLobeSharpness) * lobe[1]);
+      g[2] = l.value * dc.z * sigmoid(S(kLobeSharpness) * lobe[2]);
       const S dvalue = dot(dc, l.color);
       const bool lit = l.cosine > S(0);
       // clamped, as value / cosine diverges at 0 for powers below 1

@@ -174,7 +174,7 @@ template <class S> BT_HD float length_(S x, S y) {
   return finite_(size) ? float(size) : 0.0f;
 }
 
-template <class S> __global__ void __launch_bounds__(kThreads) note_kernel(NoteCenters<S> a) {
+template <class S> __global__ void __launch_bounds__(kThreads) statistics_kernel(DensifyStatistics<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= a.n || !(a.radii[2 * i] > S(0))) return;
   const S x = S(0.5) * S(a.width), y = S(0.5) * S(a.height);
@@ -276,8 +276,8 @@ template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, S
               a.dcorrection);
 }
 
-template <class S> void note_centers(const NoteCenters<S>& a, Stream stream) {
-  if (a.n) BT_LAUNCH(note_kernel<S>, blocks_for(a.n), dim3(kThreads), 0, stream, a);
+template <class S> void accumulate_statistics(const DensifyStatistics<S>& a, Stream stream) {
+  if (a.n) BT_LAUNCH(statistics_kernel<S>, blocks_for(a.n), dim3(kThreads), 0, stream, a);
 }
 
 template <class S> void adam(const AdamRow<S>* rows, int count, Stream stream) {
@@ -304,7 +304,7 @@ template <class S> void learn_exposure(const LearnExposure<S>& a, Stream stream)
   template void adam(const AdamRow<S>*, int, Stream);                         \
   template void picture_loss(const PictureLoss<S>&, Stream);                  \
   template void picture_loss_backward(const PictureLossBackward<S>&, Stream); \
-  template void note_centers(const NoteCenters<S>&, Stream);
+  template void accumulate_statistics(const DensifyStatistics<S>&, Stream);
 BT_INSTANTIATE(float)
 BT_INSTANTIATE(double)
 

@@ -72,7 +72,7 @@ template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, S
 
 // Updates the densification statistics [n] with a view, see `train.strategy.Strategy.accumulate`. grad and absgrad [n,
 // 2] are null if nothing was visible.
-template <class S> struct NoteCenters {
+template <class S> struct DensifyStatistics {
   int64_t n;
   const S *radii, *grad, *absgrad;
   int width, height;
@@ -86,7 +86,7 @@ template <class S> struct NoteCenters {
              max_radius);
   }
 };
-template <class S> void note_centers(const NoteCenters<S>& a, Stream stream);
+template <class S> void accumulate_statistics(const DensifyStatistics<S>& a, Stream stream);
 
 // A parameter of `count` numbers in rows of `width`, and Adam's state of it. The update of a row is multiplied by its
 // factor; null: 1. step [1] is the number of steps done.

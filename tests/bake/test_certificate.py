@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from bitymi_ns.bake import BakeOptions, BakeState, RefineOptions, TuneOptions, bake, bake_field, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bake.tile_errors import averaged, cells_per_pixel, closest_pixels, listed_errors
+from bitymi_ns.bake.tile_errors import cells_per_pixel, closest_pixels, listed_errors, moving_average
 from bitymi_ns.bake.tiles import TileVisibility
 from bitymi_ns.bundle import check_files
 from bitymi_ns.bundle.sketch import SIZE, estimated_rms, sketch, sketches_of, sketches_text
@@ -33,7 +33,7 @@ def mean_over(row: np.ndarray, center: float, width: float) -> float:
 
 
 def by_hand(values: np.ndarray, cells: tuple[float, float]) -> np.ndarray:
-    """Compute `averaged` of one channel [v, u], cell by cell."""
+    """Compute `moving_average` of one channel [v, u], cell by cell."""
     for axis, width in ((1, cells[0]), (0, cells[1])):
         count = values.shape[axis]
         at = [min(max(i + 0.5, width / 2), count - width / 2) for i in range(count)]
@@ -52,7 +52,7 @@ def by_hand(values: np.ndarray, cells: tuple[float, float]) -> np.ndarray:
 def test_a_pixel_averages_what_it_covers(size: tuple[int, int], shares: tuple[float, float], seed: int) -> None:
     values = np.random.default_rng(seed).normal(size=(size[1], size[0]))
     cells = tuple(1 + share * (side - 1) for share, side in zip(shares, size, strict=True))
-    got = averaged(torch.from_numpy(values).float()[None, None], torch.tensor([cells]))
+    got = moving_average(torch.from_numpy(values).float()[None, None], torch.tensor([cells]))
     np.testing.assert_allclose(got[0, 0].numpy(), by_hand(values, cells), atol=2e-5)
 
 
@@ -62,8 +62,8 @@ def test_a_pixel_covers_from_one_cell_to_the_whole_tile() -> None:
     cells = cells_per_pixel(shown, torch.arange(2), (8, 16))
     assert cells.tolist() == [[1.0, 8.0], [8.0, 16.0]]
     values = torch.rand(2, 3, 16, 8)
-    assert torch.equal(averaged(values, torch.ones(2, 2)), values)
-    whole = averaged(values, torch.tensor([[8.0, 16.0]] * 2))
+    assert torch.equal(moving_average(values, torch.ones(2, 2)), values)
+    whole = moving_average(values, torch.tensor([[8.0, 16.0]] * 2))
     torch.testing.assert_close(whole, values.mean((2, 3), keepdim=True).expand_as(values))
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.picture_cuda import note_centers, picture_losses
+from bitymi_ns.ops.picture_cuda import accumulate_statistics, picture_losses
 from bitymi_ns.ops.project import Projection
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import RenderOutput
@@ -106,7 +106,7 @@ def test_statistics(dtype: torch.dtype, device: torch.device) -> None:
     projection.mean2d_grad, projection.mean2d_absgrad = geom.to(device)[:, :2], absgrad.to(device)
 
     got = [value.clone().to(device) for value in before]
-    note_centers(projection, width, height, *got)
+    accumulate_statistics(projection, width, height, *got)
     seen = radii[:, 0] > 0
     scale = torch.tensor([0.5 * width, 0.5 * height], dtype=dtype)
     for value, old, grad in zip(got[:2], before[:2], (geom[:, :2], absgrad), strict=True):
@@ -117,5 +117,5 @@ def test_statistics(dtype: torch.dtype, device: torch.device) -> None:
     torch.testing.assert_close(got[3].cpu(), torch.where(seen, radius, before[3]), rtol=0, atol=0)
 
     projection.mean2d_grad = projection.mean2d_absgrad = None  # no fragment at all
-    note_centers(projection, width, height, *got)
+    accumulate_statistics(projection, width, height, *got)
     torch.testing.assert_close(got[2].cpu(), before[2] + 2.0 * seen)

@@ -113,8 +113,8 @@ NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
     "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation of the PSNR over seeds. "
     "Fitted: each half of a view after the affine map of its colours that fits the other half to the photograph, so "
-    "that exposure and white balance do not count. Mean exposure: without the exposure between those of the "
-    "neighbouring photographs that the others have. Bold: best of its scene."
+    "that exposure and white balance do not count. Mean exposure: drawn with the mean of the photographs' exposures, "
+    "the others with the exposure interpolated from the neighbouring photographs. Bold: best of its scene."
 )
 
 

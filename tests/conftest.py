@@ -12,6 +12,7 @@ import pytest
 
 os.environ.setdefault("BITYMI_NO_DOWNLOAD", "1")  # no downloads, also in child processes
 
+
 class _MissingEncoder(ModuleType):
     """Stub for the missing BC7 encoder (Python 3.10), which skips tests that use it."""
 

@@ -7,16 +7,16 @@ from torch import Tensor
 
 from . import baked_cpu, baked_cuda, webgpu
 from .backend import cuda_backend
-from .baked_scene import IMAGES, BakedScene, DrawCache, common_size, packed
-from .project import Camera
+from .baked_scene import IMAGES, BakedSceneLike, DrawCache, common_size, packed
+from .project import CameraLike
 
-__all__ = ["IMAGES", "BakedScene", "DrawCache", "common_size", "draw", "packed"]
+__all__ = ["IMAGES", "BakedSceneLike", "DrawCache", "common_size", "draw", "packed"]
 
 
 @torch.no_grad()
 def draw(
-    scene: BakedScene,
-    cameras: Sequence[Camera],
+    scene: BakedSceneLike,
+    cameras: Sequence[CameraLike],
     background: Tensor | None,
     images: Sequence[str],
     photo_pixel: float = 1.0,

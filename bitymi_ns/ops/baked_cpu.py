@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, module, require
-from .baked_scene import BakedScene, check_images, common_size, residual, tile_levels
+from .baked_scene import BakedSceneLike, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
-from .project import GEOMETRY, Camera, project
+from .project import GEOMETRY, CameraLike, project
 from .trace_cpu import tile_lists
 from .view_color import view_color
 
@@ -40,7 +40,9 @@ def coarser(atlas: Tensor, tiles: Tensor, alpha: bool) -> dict[str, Any]:
     return {name: gather(pages, of) for name, pages, of in tile_levels(atlas, tiles, alpha)}
 
 
-def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.0) -> tuple[Tensor, Tensor | None]:
+def frame(
+    scene: BakedSceneLike, camera: CameraLike, maps: bool, photo_pixel: float = 1.0
+) -> tuple[Tensor, Tensor | None]:
     """Draw a view.
 
     Args:
@@ -88,8 +90,8 @@ def frame(scene: BakedScene, camera: Camera, maps: bool, photo_pixel: float = 1.
 
 
 def draw(
-    scene: BakedScene,
-    cameras: Sequence[Camera],
+    scene: BakedSceneLike,
+    cameras: Sequence[CameraLike],
     background: Tensor | None,
     images: Sequence[str],
     photo_pixel: float = 1.0,

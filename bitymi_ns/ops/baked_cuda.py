@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from .backend import function, module, on_device, require
-from .baked_scene import IMAGES, LEVELS, BakedScene, check_images, common_size, decode_bc7, residual
+from .baked_scene import IMAGES, LEVELS, BakedSceneLike, check_images, common_size, decode_bc7, residual
 from .constants import TILE
-from .project import GEOMETRY, Camera
+from .project import GEOMETRY, CameraLike
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
 
@@ -141,7 +141,7 @@ class Atlas(NamedTuple):
         return dict(zip(LEVELS, (half, half.halved(alpha)), strict=True))
 
 
-def compiled(scene: BakedScene, photo_pixel: float = 1.0) -> Any:
+def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
     """Prepare the scene for the kernels (`BakedScene` of csrc/cuda/baked.h), with its atlas as textures. The result
     keeps all memory it refers to alive, so that recorded CUDA graphs stay valid.
 
@@ -271,7 +271,7 @@ def empty_images(names: Sequence[str], views: int, width: int, height: int, devi
     return {name: torch.empty(*shape, IMAGES[name][0], dtype=IMAGES[name][1], device=device) for name in names}
 
 
-def stack_cameras(cameras: Sequence[Camera], device: torch.device) -> tuple[Tensor, Tensor, int, int]:
+def stack_cameras(cameras: Sequence[CameraLike], device: torch.device) -> tuple[Tensor, Tensor, int, int]:
     """Stack cameras of one size: viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, width and height.
 
     Raises:
@@ -329,8 +329,8 @@ def frame(
 
 
 def draw(
-    scene: BakedScene,
-    cameras: Sequence[Camera],
+    scene: BakedSceneLike,
+    cameras: Sequence[CameraLike],
     background: Tensor | None,
     images: Sequence[str],
     photo_pixel: float = 1.0,

@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from .backend import Pool, version_of
-from .project import Camera, Prefilter
+from .project import CameraLike, Prefilter
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "rgb": (3, torch.float32),
@@ -68,7 +68,7 @@ class DrawCache:
             return self._workspaces
 
 
-class BakedScene(Protocol):
+class BakedSceneLike(Protocol):
     """A baked scene; `scene.baked.BakedScene` documents its attributes."""
 
     surfels: Mapping[str, Tensor]
@@ -90,7 +90,7 @@ class BakedScene(Protocol):
     cache: DrawCache
 
 
-def residual(scene: BakedScene) -> dict[str, Any]:
+def residual(scene: BakedSceneLike) -> dict[str, Any]:
     """Build the kernels' arguments for texels (`BakedResidual` of csrc/ops/texel.h)."""
     numbers = ("offset", "scale", "alpha_scale", "weight_bound", "transmittance_min")
     arrays = {name: getattr(scene, name) for name in ("extent", "mean_residual", "mean_alpha")}
@@ -113,7 +113,7 @@ def packed(rgb: Tensor, alpha: Tensor) -> Tensor:
     return byte[..., :1] | byte[..., 1:2] << 8 | byte[..., 2:3] << 16 | byte[..., 3:] << 24
 
 
-def common_size(cameras: Sequence[Camera]) -> tuple[int, int]:
+def common_size(cameras: Sequence[CameraLike]) -> tuple[int, int]:
     """Return the common width and height of views.
 
     Raises:

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from .backend import kernel, require, workspace
 from .constants import TILE
-from .project import Camera, Projection
+from .project import CameraLike, Projection
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ def int64s(like: Tensor, count: int) -> Tensor:
     return torch.empty(count, dtype=torch.int64, device=like.device)
 
 
-def check_pair_count(pairs: int, camera: Camera) -> None:
+def check_pair_count(pairs: int, camera: CameraLike) -> None:
     """Raise a RuntimeError if a view has 2^31 pairs of surfel and tile or more."""
     if pairs >= 2**31:
         raise RuntimeError(

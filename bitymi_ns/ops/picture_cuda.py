@@ -15,7 +15,7 @@ from .project import Projection
 
 
 @dataclass(frozen=True)
-class Photograph:
+class PhotographTarget:
     """A photograph to compare a picture with, and the weights of the losses.
 
     Attributes:
@@ -116,7 +116,7 @@ def picture_losses(
     require("picture_losses", "cuda", image.device, "call `train.losses.objective`")
     if image.dim() != 3 or image.shape[-1] != IMAGE_CHANNELS:
         raise ValueError(f"the picture is {list(image.shape)}, not [H, W, {IMAGE_CHANNELS}]")
-    photograph = Photograph(target, mask, None, ssim_weight, falloff_weight, gamma)
+    photograph = PhotographTarget(target, mask, None, ssim_weight, falloff_weight, gamma)
     photograph.check(image, tuple(image.shape[:2]))
     return _PictureLosses.apply(image, photograph)
 

@@ -16,7 +16,7 @@ from .texel import TexelAlpha
 Prefilter = Literal["low_pass", "pixel"]  # treatment of surfels smaller than a pixel, see `project`
 
 
-class Camera(Protocol):
+class CameraLike(Protocol):
     """A pinhole camera (`scene.camera.Camera`).
 
     Attributes:
@@ -60,7 +60,7 @@ class Projection:
     geom: Tensor
     frames: Tensor
     radii: Tensor
-    camera: Camera
+    camera: CameraLike
     near: float
     prefilter: Prefilter
     broken: Tensor
@@ -183,7 +183,7 @@ def rigid_gradient(means: Tensor, quats: Tensor, dmeans: Tensor, dquats: Tensor,
 
 
 def checked_geometry(
-    means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, beta_raw: Tensor, camera: Camera
+    means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, beta_raw: Tensor, camera: CameraLike
 ) -> tuple[Tensor, ...]:
     """Check the arguments of `project`; returns the surfels' in order.
 
@@ -206,7 +206,7 @@ def project(
     log_scales: Tensor,
     opacity_logits: Tensor,
     beta_raw: Tensor,
-    camera: Camera,
+    camera: CameraLike,
     near: float = 0.2,
     prefilter: Prefilter = "low_pass",
     photo_pixel: float = 1.0,

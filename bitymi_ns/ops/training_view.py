@@ -14,8 +14,8 @@ from .backend import dense, kernel, kernel_class, module, on_device, require, st
 from .bin_cuda import check_pair_count
 from .blend import checked_texels
 from .constants import FRAME, GEOM
-from .picture_cuda import Photograph
-from .project import GEOMETRY, Camera, Prefilter, Projection, checked_geometry, rigid_gradient
+from .picture_cuda import PhotographTarget
+from .project import GEOMETRY, CameraLike, Prefilter, Projection, checked_geometry, rigid_gradient
 from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
 from .view_color import check_view_color, lettered
 from .view_kinds import entry_of
@@ -39,8 +39,8 @@ class ComparedView:
 class _Drawing:
     """Arguments of `_TrainingView` without gradients, and the projection that it makes."""
 
-    camera: Camera
-    photograph: Photograph
+    camera: CameraLike
+    photograph: PhotographTarget
     kind: str
     near: float
     prefilter: Prefilter
@@ -143,8 +143,8 @@ class _TrainingView(torch.autograd.Function):
 def training_view(
     kind: str,
     surfels: Mapping[str, Tensor],
-    camera: Camera,
-    photograph: Photograph,
+    camera: CameraLike,
+    photograph: PhotographTarget,
     correction: Tensor | None = None,
     texels: Tensor | None = None,
     tiles: TexelTiles | None = None,

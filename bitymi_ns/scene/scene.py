@@ -29,7 +29,7 @@ from bitymi_ns.ops import (
     view_color,
 )
 from bitymi_ns.ops.constants import IMAGE_CHANNELS
-from bitymi_ns.ops.picture_cuda import Photograph
+from bitymi_ns.ops.picture_cuda import PhotographTarget
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.training_view import ComparedView, training_view
 
@@ -218,7 +218,7 @@ class Scene(nn.Module):
     def compare(
         self,
         camera: Camera,
-        photograph: Photograph,
+        photograph: PhotographTarget,
         correction: Tensor | None = None,
         field_mode: Literal["train", "frozen"] = "train",
     ) -> ComparedView | None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
-from bitymi_ns.ops.picture_cuda import Photograph
+from bitymi_ns.ops.picture_cuda import PhotographTarget
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
@@ -63,7 +63,7 @@ def view_losses(
     compared: ComparedView | None = None
     if not maps and overdraw_half is None and fused_losses(loss, target):
         weights = (loss.ssim_weight, loss.falloff_weight, loss.falloff_gamma)
-        photograph = Photograph(target, view.mask, background, *weights)
+        photograph = PhotographTarget(target, view.mask, background, *weights)
         compared = scene.compare(view.camera, photograph, view.correction, field_mode)
     if compared is not None:
         terms = {"photometric": compared.photometric}

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from bitymi_ns import ops
-from bitymi_ns.ops.picture_cuda import Photograph
+from bitymi_ns.ops.picture_cuda import PhotographTarget
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.texel import TexelDescent
 from bitymi_ns.ops.training_view import ComparedView, training_view
@@ -148,7 +148,7 @@ def test_wrong_arguments_are_named(device: torch.device) -> None:
     photo = torch.rand(HEIGHT, WIDTH, 3).double().to(device)
 
     def call(target: Tensor = photo, correction: Tensor | None = None, **options: Any) -> None:
-        photograph = Photograph(target, None, None, 0.2, 0.5, 4.0)
+        photograph = PhotographTarget(target, None, None, 0.2, 0.5, 4.0)
         training_view("sv", scene.surfels, camera, photograph, correction, **options)
 
     with pytest.raises(ValueError, match="the photograph"):
@@ -160,7 +160,7 @@ def test_wrong_arguments_are_named(device: torch.device) -> None:
     with pytest.raises(ValueError, match="other tiles"):
         call(alpha=replace(alpha, tiles=others), **texture)
     with pytest.raises(ValueError, match="view_colour|view colour"):
-        training_view("none", scene.surfels, camera, Photograph(photo, None, None, 0.2, 0.5, 4.0))
+        training_view("none", scene.surfels, camera, PhotographTarget(photo, None, None, 0.2, 0.5, 4.0))
 
 
 class Operations(TorchDispatchMode):

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from bitymi_ns.ops.project import CameraLike
 from bitymi_ns.ops.reference.project import BETA_MAX, LOG_SCALE_MAX
-from bitymi_ns.ops.reference.render import Camera
 from bitymi_ns.ops.reference.trace import ALPHA_MAX, ALPHA_MIN, SUPPORT, TRANSMITTANCE_MIN
 
 Array = npt.NDArray[np.clongdouble]
@@ -30,7 +30,7 @@ class Extended:
     low_pass: npt.NDArray[np.bool_]  # [P, N]
 
 
-def render(geometry: Sequence[npt.ArrayLike], camera: Camera, near: float = 0.2) -> Extended:
+def render(geometry: Sequence[npt.ArrayLike], camera: CameraLike, near: float = 0.2) -> Extended:
     """Render every pixel against every surfel; arguments as `reference.render`, real or complex, without colours."""
     mean, q, logs, logit, raw, view, k = (
         np.asarray(a, dtype=np.clongdouble) for a in (*geometry, camera.viewmat, camera.K)

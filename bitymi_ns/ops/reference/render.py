@@ -2,22 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops.project import CameraLike
 from bitymi_ns.ops.reference.project import project, unit
 from bitymi_ns.ops.reference.trace import SUPPORT, Trace, trace
-
-
-class Camera(Protocol):
-    """A pinhole camera: viewmat [4, 4] world to camera with OpenCV axes, K [3, 3] in pixels, image size."""
-
-    viewmat: Tensor
-    K: Tensor
-    width: int
-    height: int
 
 
 @dataclass
@@ -81,7 +72,7 @@ def fetched(tiles: Sequence[Tensor], uv: Tensor, where: Tensor) -> Tensor:
 def render(
     geometry: Sequence[Tensor],
     colors: Tensor,
-    camera: Camera,
+    camera: CameraLike,
     background: Tensor | None = None,
     tiles: Sequence[Tensor] | None = None,
     residual: Callable[[Tensor], Tensor] | None = None,

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from ..baked_scene import BakedScene
+from ..baked_scene import BakedSceneLike
 from ..constants import SUPPORT
 from ..view_color import LEAN, check_lean, check_view_color
 from ..view_kinds import VIEW_COLORS
@@ -36,7 +36,7 @@ class Arrays:
     origin: npt.NDArray[np.float64]  # [3] subtracted from positions, for float32 resolution far from the world's origin
 
 
-def arrays(scene: BakedScene) -> Arrays:
+def arrays(scene: BakedSceneLike) -> Arrays:
     """Convert a scene.
 
     Raises:
@@ -69,7 +69,7 @@ def arrays(scene: BakedScene) -> Arrays:
     return Arrays(surfels, terms.numpy().ravel(), KINDS[kind], origin.numpy())
 
 
-def _set_tiles(surfels: npt.NDArray, scene: BakedScene) -> None:
+def _set_tiles(surfels: npt.NDArray, scene: BakedSceneLike) -> None:
     texels = scene.blocks if scene.atlas is None else scene.atlas
     if texels is None:
         return

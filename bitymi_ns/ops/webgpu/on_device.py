@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from ..baked_cuda import decoded
-from ..baked_scene import BakedScene, check_images, common_size
-from ..project import Camera
+from ..baked_scene import BakedSceneLike, check_images, common_size
+from ..project import CameraLike
 from .arrays import arrays
 from .device import check_room, device, in_software, library
 from .programs import Programs
@@ -63,7 +63,7 @@ class SceneOnDevice:
         TypeError, ValueError: as `arrays`.
     """
 
-    def __init__(self, scene: BakedScene) -> None:
+    def __init__(self, scene: BakedSceneLike) -> None:
         self._programs, self._device = programs(), device()
         packed = arrays(scene)
         self._origin, self._kind = packed.origin, packed.kind
@@ -99,7 +99,7 @@ class SceneOnDevice:
             data = np.zeros(24, np.float32)
         return self._device.create_buffer_with_data(data=np.ascontiguousarray(data), usage=usage)
 
-    def _texture(self, scene: BakedScene) -> tuple[Any, tuple[int, int]]:
+    def _texture(self, scene: BakedSceneLike) -> tuple[Any, tuple[int, int]]:
         features = self._device.features
         texels, blocks = scene.atlas, scene.blocks
         software = in_software()
@@ -234,7 +234,7 @@ class SceneOnDevice:
             self._target = _Target((width, height), (sums, copy), before, read, row)
         return self._target
 
-    def _set_frame(self, camera: Camera, show: str, layers: int, photo_pixel: float) -> None:
+    def _set_frame(self, camera: CameraLike, show: str, layers: int, photo_pixel: float) -> None:
         viewmat, K = camera.viewmat.cpu().double().numpy(), camera.K.cpu().double().numpy()
         center = camera.exact_center.cpu().double().numpy() - self._origin
         rows = [(*viewmat[k, :3], 0.0) for k in range(3)]
@@ -250,7 +250,7 @@ class SceneOnDevice:
         )
         self._device.queue.write_buffer(self._frame, 0, data)
 
-    def draw(self, camera: Camera, show: str, layers: int, photo_pixel: float = 1.0) -> npt.NDArray[np.float32]:
+    def draw(self, camera: CameraLike, show: str, layers: int, photo_pixel: float = 1.0) -> npt.NDArray[np.float32]:
         """Draw a view.
 
         Args:
@@ -328,8 +328,8 @@ class SceneOnDevice:
 
 
 def draw(
-    scene: BakedScene,
-    cameras: Sequence[Camera],
+    scene: BakedSceneLike,
+    cameras: Sequence[CameraLike],
     background: Tensor | None,
     images: Sequence[str],
     photo_pixel: float = 1.0,

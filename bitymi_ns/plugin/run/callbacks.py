@@ -23,7 +23,7 @@ from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_cap
 from bitymi_ns.plugin.run.memory import state_training
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.train import limits
+from bitymi_ns.train import messages
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.init import scene_extent, views_without_surfels
 from bitymi_ns.train.step import Training
@@ -70,9 +70,9 @@ class TrainingRun:
         self.names = {"experiment_name": trainer.config.experiment_name, "method_name": trainer.config.method_name}
         self._held_back = False  # densification has met its bound, and a warning said so
         for sentence in (
-            *limits.other_options(model.recorded_options, config),
-            *limits.recorded_rules(config),
-            *limits.short_run(self.training.schedule, len(train), scene.config.texture == "hash", processes.views),
+            *messages.other_options(model.recorded_options, config),
+            *messages.recorded_rules(config),
+            *messages.short_run(self.training.schedule, len(train), scene.config.texture == "hash", processes.views),
         ):
             say(sentence)
         _ = self.datamanager.cached_train  # read images now: loading is not training time
@@ -144,7 +144,7 @@ class TrainingRun:
         if report.get("held_back") and not self._held_back:
             self._held_back = True
             most = self.training.strategy.most
-            warn(limits.held_back(int(report["held_back"]), most, self.config))
+            warn(messages.held_back(int(report["held_back"]), most, self.config))
         if report:
             writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
         if step in self.curve_steps:

@@ -25,7 +25,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
-from bitymi_ns.train import limits
+from bitymi_ns.train import messages
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import build_scene, limit_first_surfels
 from bitymi_ns.train.losses import photometric
@@ -163,7 +163,7 @@ class BitymiModel(SurfelModel):
     def get_extra_state(self) -> dict[str, Any]:
         """Return tensors, numbers and text only, for torch's safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
-        state["train"] = limits.recorded(self.train_config)
+        state["train"] = messages.recorded(self.train_config)
         state["near"], state["first_surfels"] = self.scene.near, self.metadata["first_surfels"]
         if self._run is not None:
             state["trained_for"] = self._run.total
@@ -225,7 +225,7 @@ def new_scene(
         background = find_background() if find_background and train.background_points else None
         bounded = metadata.get("has_alpha", False)
         scene, report = build_scene(xyz, rgb, centers, config, train, bounded, pixels, box, declared, background)
-    for sentence in limits.warnings_at_start(report, train, pixels, config):
+    for sentence in messages.warnings_at_start(report, train, pixels, config):
         say(sentence)
     if report.random:
         say(f"Surfels are made of {report.random:,} random points.")

@@ -1,10 +1,10 @@
 #!/usr/bin/env python
 """Transfer the package to a bare machine with a GPU, and run tests and benchmarks there.
 
-`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, and downloads the dependencies of
-it and nerfstudio except torch and numpy, in parts FOLDER/0, FOLDER/1, ... of limited size. `card.py run ORDER...
---stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has its own time limit.
-Orders joined by a plus sign run concurrently, for steps that are not timed."""
+`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies and
+nerfstudio's except torch and numpy, and sorts them into parts FOLDER/0, FOLDER/1, ... of limited size. `card.py run
+ORDER... --stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has its own time
+limit. Orders joined by a plus sign run concurrently, for steps that are not timed."""
 
 import argparse
 import os
@@ -56,7 +56,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         results: folder of the tables.
         data: folder of captures.
         surfels: numbers of surfels of the synthetic scenes.
-        steps: of the runs of `train` and `nerfstudio`; None: the script's default.
+        steps: length of the runs of `train` and `nerfstudio`; None: `REFERENCE_STEPS`, and the script's default.
     """
     length = [] if steps is None else ["--steps", str(steps)]
     on_card = ("--runs", f"{steps or REFERENCE_STEPS}/1", "--device", "cuda", "--work", results / "runs")
@@ -122,7 +122,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
     }
 
 
-REFERENCE_STEPS = 30_000  # of a run of `train`
+REFERENCE_STEPS = 30_000  # default length of the runs of `train`
 GAUSSIANS = (300_000, 1_000_000)  # numbers of Gaussians trained for comparison
 
 
@@ -138,7 +138,7 @@ SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 
 def stage(arguments: argparse.Namespace) -> int:
-    """Collect the wheels and LPIPS's weights."""
+    """Collect the wheels and LPIPS's weights in parts, see above."""
     folder = arguments.folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     for file in folder.glob("*/*"):
@@ -245,7 +245,7 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
 
 
 def main() -> int:
-    """Command line."""
+    """Stage the wheels or run the orders, as the command line says; return the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

@@ -142,8 +142,8 @@ WAITS_STEPS = 60  # length of the run in which synchronisations are counted
 
 
 def waits(words: Sequence[str]) -> None:
-    """Train in this process and print torch's GPU synchronisations in the median step of the second half of the run,
-    which has no point of the curve. The compiled module waits once more, for the number of pairs."""
+    """Train in this process and print how often torch synchronises with the GPU in the median step of the second half
+    of the run, a step without evaluation. The compiled module waits once more per step, to read the number of pairs."""
     import torch
 
     from bitymi_ns.train.step import Training
@@ -203,7 +203,7 @@ def tables(folder: Path, commands: Commands) -> str:
 
 
 def main() -> int:
-    """Command line."""
+    """Run the commands on a capture and publish their costs; return 1 if any failed."""
     if sys.argv[1:2] == ["--waits"]:
         waits(sys.argv[2:])
         return 0

@@ -80,9 +80,9 @@ Scenes = dict[str, dict[str, float]]  # scene -> figure -> value
 
 
 class Calibration:
-    """A fixed workload of the kinds that training consists of (matrix product, sort, gather from 32 MB, chains of small
-    tensors, Python), run repeatedly while a part is timed, so that a slow machine slows both. None dominates: the
-    gather alone varies twice as much as training does when other programs share the caches."""
+    """Fixed mixture of the operations of training (matrix product, sort, gather from 32 MB, chains of small tensors,
+    Python), run repeatedly while a part is timed, so that a slow machine slows both. No operation dominates: the gather
+    alone varies twice as much as training does when other programs share the caches."""
 
     def __init__(self) -> None:
         generator = torch.Generator().manual_seed(0)
@@ -114,7 +114,8 @@ class Calibration:
         return lambda *_: self.run() if next(calls) % n == 0 else None
 
     def timed(self, work: Callable[[], Any]) -> tuple[Any, float]:
-        """Run `work`; return its result and its CPU seconds in calibrations within it (or after it)."""
+        """Run `work`; return its result and its CPU time, as a multiple of the median calibration run during it (else
+        after it)."""
         self.seconds.clear()
         start = time.process_time()
         result = work()
@@ -168,7 +169,7 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
 
 
 def run_job(data: Path, downscale: int) -> dict[str, float]:
-    """Measure the figures of one scene in this process: means over the seeds (the least of times), and peak memory."""
+    """Measure the figures of one scene in this process: means over the seeds (minima of times), and peak memory."""
     torch.set_num_threads(int(THREADS["OMP_NUM_THREADS"]))
     calibration = Calibration()
     capture = load_capture(data, downscale=downscale)
@@ -233,7 +234,7 @@ def measure(capture: Path | None) -> Scenes:
 
 
 def main() -> None:
-    """Command line."""
+    """Measure the job and compare it with the baseline, or accept it as the baseline."""
     parser = Arguments(__doc__)
     parser.add_argument("--capture", type=Path, help="an undistorted capture to run at half its size beside the room")
     parser.add_argument("--accept", action="store_true", help="make the figures the new baseline")

@@ -68,14 +68,14 @@ def synthetic(n: int, width: int, height: int, options: Options) -> list[str]:
 
 
 def bundled(folder: Path, width: int, height: int, options: Options) -> list[str]:
-    """Row of a bundle."""
+    """Measure the row of a bundle."""
     bundle = read_bundle(folder, decode=options.device.type != "cuda")
     scene = bundle.scene.to(options.device)
     return row(f"{folder.name}, {len(bundle):,}", scene, around(bundle, width, height), options)
 
 
 def row(name: str, scene: BakedScene, cameras: Sequence[Camera], options: Options) -> list[str]:
-    """Cells of HEADER."""
+    """Measure the cells of HEADER."""
     width, height, mean = cameras[0].width, cameras[0].height, measured(scene, cameras, options)
     say(f"{name} surfels, {width} x {height}: {mean['graph']:.3f} ms")
     return [
@@ -108,7 +108,7 @@ def card(device: torch.device) -> list[str]:
 
 
 def main() -> int:
-    """Command line."""
+    """Time the scenes and publish the table."""
     parser = Arguments(__doc__)
     parser.add_argument("--surfels", nargs="*", type=int, default=[50_000, 150_000, 500_000], help="of the scenes")
     parser.add_argument("--sizes", nargs="+", type=image_size, default=SIZES, metavar="WxH", help="(%(default)s)")

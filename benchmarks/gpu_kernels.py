@@ -90,7 +90,7 @@ SECTIONS |= {"listed": partial(texels, most=1 << 30), "deterministic": exact}
 
 
 def main() -> int:
-    """Command line."""
+    """Run or time the chosen kernels."""
     parser = Arguments(__doc__)
     parser.add_argument("--surfels", type=int, default=300)
     parser.add_argument("--size", type=image_size, default="96x64", metavar="WxH", help="image size (%(default)s)")

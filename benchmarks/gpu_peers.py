@@ -190,7 +190,7 @@ def row(
 
 
 def main() -> int:
-    """Command line."""
+    """Train Gaussians, or measure all renderers and publish the table."""
     parser = Arguments(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--train", nargs="+", type=int, metavar="COUNT", help="train so many Gaussians, draw nothing")

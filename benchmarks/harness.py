@@ -16,7 +16,7 @@ from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.markdown import number, page, table
 from bitymi_ns.train.losses import fitted_psnr, psnr
 
-__all__ = ["number", "say", "table"]  # as in `bitymi bench`
+__all__ = ["number", "say", "table"]  # re-exported: tables as those of `bitymi bench`
 CLOCK = 2.0e9  # upper bound of GPU clocks, Hz, to convert seconds to cycles of `torch.cuda._sleep`
 
 
@@ -62,7 +62,7 @@ class Rows:
     failed: list[str] = field(default_factory=list)
 
     def add(self, what: str, measure: Callable[[], Sequence[str]]) -> None:
-        """Measure a row."""
+        """Measure a row; if that raises, list the error instead."""
         try:
             self.cells.append(measure())
         except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:

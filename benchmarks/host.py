@@ -1,8 +1,8 @@
-"""Print what a training step costs the host on CUDA: time, kernels, torch operations and waits, without a card.
+"""Measure the host's share of a CUDA training step without a GPU: time, kernel launches, torch operations and waits.
 
-The emulator's kernels return at once and memory is cleared, so the time is that of Python, torch and the bindings; a
-card's launches and allocator add to it. `wait`: operations of torch that read from the device; the emulated device is
-the CPU, where losses are checked in every step, on a card every few.
+The emulated kernels return at once, so the time is that of Python, torch and the bindings; a GPU's launches and
+allocator add to it. Waits are operations of torch that read from the device. Losses are checked in every step here,
+every few on a GPU, because the emulated device is the CPU.
 
     python benchmarks/host.py [--exposure gain]
 """
@@ -31,7 +31,7 @@ VIEWED = ("detach", "view", "select", "slice", "unbind", "alias", "expand", "as_
 
 
 class Counted(TorchDispatchMode):
-    """Counts torch's operations by name."""
+    """Counter of torch's operations by name."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Counted(TorchDispatchMode):
 
 @contextmanager
 def idle(emulator: ModuleType) -> Iterator[None]:
-    """Make kernels return at once; new memory is cleared, so that counts that nobody wrote are 0."""
+    """Make kernels return at once; clear new memory, so that counts that no kernel wrote are 0."""
     replaced = [(torch, "empty", torch.zeros), (torch, "empty_like", torch.zeros_like)]
     replaced.append((Tensor, "new_empty", Tensor.new_zeros))
     kept = [(where, name, getattr(where, name)) for where, name, _ in replaced]
@@ -81,7 +81,7 @@ def row(run: Trainer, emulator: ModuleType, stage: str) -> str:
 
 
 def trainer(exposure: str) -> Trainer:
-    """Make a run of few surfels, whose texels start at once."""
+    """Make a run of 40 surfels on random photographs, with texels from step TEXELS on."""
     g = torch.Generator().manual_seed(0)
     points, colors = torch.rand(40, 3, generator=g) - 0.5, torch.rand(40, 3, generator=g)
     viewmat, K = torch.eye(4), torch.tensor([[24.0, 0, 12], [0, 24, 12], [0, 0, 1]])

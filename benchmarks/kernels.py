@@ -149,7 +149,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
 
 
 def main() -> int:
-    """Command line."""
+    """Time the kernels and publish a table per scene."""
     parser = Arguments(__doc__)
     parser.add_argument("--surfels", nargs="+", type=int, default=[5_000, 20_000], help="sizes of the scene")
     parser.add_argument("--width", type=int, default=270)

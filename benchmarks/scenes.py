@@ -153,7 +153,7 @@ class SplitCapture:
     """A capture for training."""
 
     train: list[View]
-    held_out: list[View]  # every `HELD_OUT`-th photograph, including the first
+    held_out: list[View]  # those of the capture's own split, else every eighth photograph
     points: Tensor  # [M, 3] sparse points
     colours: Tensor  # [M, 3] in [0, 1]
     white: bool = False  # evaluate images with alpha over white, as for Blender's captures
@@ -169,7 +169,7 @@ def load_capture(path: Path, downscale: int = 1) -> SplitCapture:
     coordinate is 1. The orientation is kept.
 
     Args:
-        path: a folder or file, see `bitymi_ns.load_capture`; of Blender's, the first *_pc.ply has the points.
+        path: a folder or file, see `bitymi_ns.load_capture`; Blender's get their points from the first *_pc.ply.
         downscale: integer factor by which photographs are downscaled.
 
     Raises:

@@ -42,7 +42,7 @@ def load_capture(
 
     Photographs are undistorted; those of wide cameras become several views. All stay in memory as bytes. Poses, scale
     and axes of the world are those of the capture's files, but a COLMAP model's are turned so that up, about -y, is z.
-    Cameras and points are float32: move captures whose coordinates have many digits before the point first.
+    Cameras and points are float32: translate captures with large coordinates (UTM, for example) to the origin first.
 
     Args:
         path: a folder, or a file: transforms.json or a video.
@@ -144,10 +144,10 @@ def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
 
 
 def _logit(share: Tensor) -> Tensor:
-    """Compute logits, which the operations invert, clamped to finite values with a straight-through gradient.
+    """Compute logits, clamped to finite values with a straight-through gradient.
 
-    The operations take parameters as training has them: the slope of a sigmoid follows from its argument alone, as in
-    float32 nothing is left of 1 - o where o -> 1.
+    The operations take logits, like those of training, and apply the sigmoid: its slope o (1 - o) is exact as a
+    function of the logit, but in float32 nothing is left of 1 - o where o -> 1.
     """
     nearest = share.clamp(1e-12, 1.0 - 8 * torch.finfo(share.dtype).eps)
     return torch.logit(share + (nearest - share).detach())

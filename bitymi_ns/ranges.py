@@ -1,4 +1,4 @@
-"""Ranges of options as types of their fields, validation errors of such data, and samples of a range."""
+"""Types of options with their ranges, messages of validation errors, and evenly spread indices."""
 
 import re
 from dataclasses import asdict

@@ -174,11 +174,11 @@ def check_replaceable(
     """Check that a folder is missing or empty, or holds an earlier result alone, which may be replaced.
 
     Args:
-        what: names such a result, as "a bundle".
+        what: name of such a result in messages, e.g. "a bundle".
         made: names of all files of the result in the folder, read after the other checks; None: it has none.
         overwrite: an earlier result may be replaced.
         refuse: makes the exception to raise.
-        option: lets an earlier result be replaced.
+        option: command-line option that sets `overwrite`, for messages.
     """
     if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return

@@ -14,7 +14,15 @@ import bitymi_ns
 
 
 def main(image: Path, output: Path, surfels: int = 2000, steps: int = 300, size: int = 256) -> float:
-    """Optimize surfels on a plane before the camera; returns the last mean square error."""
+    """Optimize surfels on a plane in front of the camera; return the last mean square error.
+
+    Args:
+        image: picture to fit.
+        output: file for the rendered picture.
+        surfels: number of surfels.
+        steps: steps of Adam.
+        size: longest side to which the picture is reduced, pixels.
+    """
     photo = Image.open(image).convert("RGB")
     photo.thumbnail((size, size))
     target = torch.from_numpy(np.asarray(photo, dtype=np.float32) / 255.0)  # [H, W, 3]

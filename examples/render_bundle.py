@@ -12,7 +12,7 @@ import bitymi_ns
 
 
 def main(bundle: Path, output: Path, most: int = 8, device: str = "cpu") -> list[Path]:
-    """Draw up to `most` of the bundle's cameras as PNG files; returns their paths."""
+    """Render the views of the bundle's first `most` cameras to PNG files; return their paths."""
     scene = bitymi_ns.read_bundle(bundle).to(device)
     output.mkdir(parents=True, exist_ok=True)
     paths = []

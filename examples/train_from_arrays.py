@@ -15,7 +15,7 @@ import bitymi_ns
 
 
 def main(capture: Path, bundle: Path, steps: int = 1500) -> float:
-    """Train from the capture's points, bake, and print the PSNR of the held-out views in dB."""
+    """Train from the capture's points, bake, and print and return the mean PSNR of the held-out views in dB."""
     training, points, colors = bitymi_ns.load_capture(capture, "train")
     held_out, *_ = bitymi_ns.load_capture(capture, "test", points="random")
     scene, log = bitymi_ns.train_scene(training, points, colors, steps=steps, eval_views=held_out)

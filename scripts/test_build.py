@@ -31,7 +31,7 @@ def preload() -> str:
 
 
 def main() -> int:
-    """Command line."""
+    """Load the build in place of the installed kernels and run the tests; return the exit status."""
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("build", type=Path, help="CMake's folder")
     parser.add_argument("tests", nargs="+", help="what pytest is to run")

@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Make a CUDA build of torchvision importable beside a CPU build of torch, in this virtual environment.
 
-`import torchvision`, and so nerfstudio, then fails with "operator torchvision::nms does not exist". The better solution
-is the matching CPU wheel (https://download.pytorch.org/whl/cpu). If the import fails with just this message, this
-script adds two files to site-packages that declare the missing operators when torchvision is imported."""
+Without this, `import torchvision`, and so nerfstudio, fails with "operator torchvision::nms does not exist". The better
+solution is the matching CPU wheel (https://download.pytorch.org/whl/cpu). If the import fails with just this message,
+this script adds two files to site-packages that declare the missing operators when torchvision is imported."""
 
 import subprocess
 import sys

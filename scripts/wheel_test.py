@@ -107,7 +107,7 @@ def install(wheel: Path, folder: Path) -> Path:
 
 
 def main() -> None:
-    """Command line."""
+    """Build the wheel, check its contents, install it and run the tests."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         wheel = build(folder)

@@ -29,11 +29,11 @@ from bitymi_ns.train.views import View
 
 START = 8.0 / 255**2  # first lambda of the search: squared error per bit, colours from 0 to 1
 MAX_LAMBDA = 4.0 / 255**2
-"""Largest lambda where a share of the error decides: no texel can correct much of a large error, as of exposure, and
-that does not hide the error of rounding; and texels learn little behind steps above the 4.2 of 255 that this gives."""
+"""Largest lambda where `Compact.share` decides. A large error that texels cannot correct, as of exposure, would allow
+much rounding, but does not hide it; and texels learn little with steps above the 4.2 of 255 that this lambda gives."""
 TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned after it, as a share of that of everything else
 ENOUGH = 0.002
-"""Share of the error (0.009 dB) that may be added even where a size is asked for: finer is not worth bytes."""
+"""Added error, as a share of the bake's (0.009 dB), below which precision is not worth bytes that a size allows."""
 LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 COARSER, FINER = 12.0, 1.0 / 32
@@ -49,9 +49,9 @@ class Compact:
     Attributes:
         share: how much it may add to the mean square error of the pictures against the training photographs, as a share
             of it, before the texels are tuned; less where lambda would exceed `MAX_LAMBDA`.
-        most_bytes: as small as it takes for surfels and texels to be no more than this, or smaller where more would add
-            no more than `ENOUGH` of the error; None = `share` decides.
-        psnr: as small as it may be for the training photographs to be shown at so many dB, before the texels are tuned;
+        most_bytes: limit of the bytes of surfels and texels, not used up where the added error is below `ENOUGH`;
+            None = `share` decides.
+        psnr: PSNR on the training photographs that the smallest bundle must reach before the texels are tuned, dB;
             None = `share` decides.
         views: training views that are drawn, spread over all.
     """
@@ -75,7 +75,7 @@ class Compact:
         return replace(self, most_bytes=size - beside)
 
     def check(self) -> None:
-        """Check the values."""
+        """Check the values; raise ValueError for one out of range."""
         if not 0 < self.share < 1 or self.views < 1:
             raise ValueError(f"the share of the error must lie between 0 and 1, not at {self.share}")
         if self.most_bytes is not None and self.psnr is not None:
@@ -91,7 +91,7 @@ class RatePoint:
     coding: TexelCodeOptions  # of the texels
     texels: TexelCodes | None  # codes of its texels; None without
     error: float  # mean square error against the training photographs
-    psnr: float  # of them, dB
+    psnr: float  # on them, dB
 
     @cached_property
     def bytes(self) -> int:
@@ -194,8 +194,8 @@ def compacted(
     progress: Progress = no_progress,
     device: torch.device = _CPU,
 ) -> tuple[BakeState, TexelCodeOptions]:
-    """Round the surfels of a bake to the values of a compact bundle, in its order, and choose the coding of its texels,
-    for `tune.tune_atlas` or `with_coded_texels`.
+    """Round the surfels of a bake to the values of a compact bundle, in Morton order, and choose the coding of the
+    texels, for `tune.tune_atlas` or `with_coded_texels`.
 
     Args:
         baked: with lean view colours, on the CPU.
@@ -259,10 +259,11 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float]] 
 def _search(
     coder: Coder, excess: Callable[[RatePoint], float], progress: Progress, most: float = math.inf
 ) -> tuple[RatePoint, RatePoint]:
-    """Bisect lambda up to `most`, to a tenth: the last passing point (excess at most 1) and the first failing one.
+    """Bisect lambda up to `most`, until the excess is 0.9 to 1: the last passing point (excess at most 1) and the first
+    failing one.
 
-    An excess that is finite and above 0 gives the next lambda, as nearly proportional. Without a point of a kind,
-    returns the nearest that was tried."""
+    A finite excess above 0 is about proportional to lambda, and gives the next one. If no point passes, or none fails,
+    the nearest that was tried is returned instead."""
     low, high, found = None, None, {}
     lmbda = min(START, most)
     for step in range(_SEARCH):
@@ -270,7 +271,7 @@ def _search(
         progress("choosing the precision", step + 1, _SEARCH)
         share = excess(found[lmbda])
         low, high = (lmbda, high) if share <= 1 else (low, lmbda)
-        found = {tried: found[tried] for tried in {low, high, min(found), max(found)} - {None}}  # the rest is memory
+        found = {tried: found[tried] for tried in {low, high, min(found), max(found)} - {None}}  # frees memory
         if low == most or 0.9 <= share <= 1:
             break
         least, largest = low or lmbda / 8, high or min(most, lmbda * 8)

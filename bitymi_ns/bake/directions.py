@@ -21,7 +21,7 @@ class Directions:
 
     rows: Tensor  # [n] int64 rows of the surfels
     unit: Tensor  # [n, D, 3] float32 unit vectors from the camera to the surfel, world frame; those of the views first
-    valid: Tensor  # [n, D] bool; the rest of a row is filling
+    valid: Tensor  # [n, D] bool; False: padding
     views: int  # number of the D columns that are for views
     view: Tensor  # [n, views] int64, view of each of these columns
 
@@ -52,7 +52,7 @@ def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Di
         yield Directions(rows, unit, valid, 0, rows.new_zeros(len(rows), 0))
     g = torch.Generator().manual_seed(0)
     lot = torch.rand(BETWEEN, 3, generator=g).to(means)
-    share = -torch.rand(BETWEEN, 3, generator=g).clamp(min=1e-6).log()  # normalised: even over the triangle
+    share = -torch.rand(BETWEEN, 3, generator=g).clamp(min=1e-6).log()  # normalised: uniform over the triangle
     share = (1 / 3 + _REACH * (share / share.sum(1, keepdim=True) - 1 / 3)).to(means)
     rest = order[unseen:]
     while len(rest):

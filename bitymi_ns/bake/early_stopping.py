@@ -39,7 +39,7 @@ class EarlyStopping(Generic[S]):
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
 
     def due(self, done: int) -> bool:
-        """True if the validation views are evaluated after this step."""
+        """Return True if the validation views are evaluated after this step."""
         return done % self._every == 0 or done == self._steps
 
     def update(self, done: int, psnr: float, state: Callable[[], S]) -> bool:

@@ -15,7 +15,7 @@ from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import View
 
 WIDEST, NARROWEST = 4.0, 1.0 / 64
-"""Steps are chosen between these, in reference steps; beyond, errors are not proportional to them."""
+"""Range of the steps, as multiples of the reference steps; beyond it, errors are not proportional to steps."""
 PER_BIT = 2.0 * math.log(2.0)  # relative fall, per bit, of an error proportional to the square of a step
 
 
@@ -24,7 +24,7 @@ class Pictures:
 
     Attributes:
         views: how many there are.
-        numbers: of all their pixels that count, three each.
+        numbers: how many colour values their unmasked pixels have, three each.
     """
 
     def __init__(
@@ -65,18 +65,18 @@ class Pictures:
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """Image error of rounding by column of `REFERENCE`."""
+    """Image error of rounding, for each column of `REFERENCE`."""
 
-    noise: Mapping[str, float]  # mean square error of the pictures by the square of the step; 0 = it is not seen
+    noise: Mapping[str, float]  # mean square error of the pictures over the squared step; 0 = not visible
     counts: Mapping[str, int]  # numbers of the column
 
     def steps(self, lmbda: float) -> dict[str, float]:
-        """Choose the steps at which a further bit for each number of a column saves lambda.
+        """Choose the steps at which one more bit per number of a column lowers the error by lambda per bit.
 
         A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number.
 
         Args:
-            lmbda: mean square error of the images per bit; 0 = not known: the reference steps.
+            lmbda: mean square error of the images per bit; 0 = unknown: take the reference steps.
         """
         if lmbda == 0:
             return dict(REFERENCE)

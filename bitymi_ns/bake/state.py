@@ -50,7 +50,7 @@ class BakeState:
     # [T, C] float32 before quantisation, in the order of `ops.TexelTiles`: residual colours and, where C = 4, alpha; a
     # surfel without a tile has one texel, its constant
     texels: Tensor
-    atlas: EncodedAtlas | None  # the encoded atlas, None without texture
+    atlas: EncodedAtlas | None  # the encoded atlas; None = no tiles, or not encoded yet
     options: BakeOptions  # options of the bake
     # surfels left out, sizes, and errors
     statistics: Statistics = field(default_factory=Statistics)
@@ -214,8 +214,8 @@ def export(
     Args:
         background: colour behind the surfels.
         statistics: added to those of the bake.
-        first: initial camera of viewers, which the poster shows: the first held-out one of cameras.json, else its
-            first; None = the bundle gets no poster.
+        first: camera of the poster, the one with which viewers start: the first held-out one of cameras.json, else its
+            first; None = no poster.
     """
     baked = baked.encoded()
     return write_bundle(

@@ -16,7 +16,7 @@ from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 
-ALPHA_CONTRAST = 0.25  # of an error of alpha: how far a surfel's colour differs from that behind it, as a rule
+ALPHA_CONTRAST = 0.25  # weight of an error of alpha: typical difference between a surfel's colour and that behind it
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,10 @@ def texel_centers(count: int, extent: Tensor) -> Tensor:
 
     Args:
         count: texels along the axis.
-        extent: [...] half sides of tiles in scale units (e; 3 covers exactly the support), [1] or broadcast with it.
+        extent: [..., 1] half sides of tiles in scale units (e; 3 covers exactly the support).
 
     Returns:
-        [..., count] of the extents' type.
+        [..., count] in the dtype of the extents.
     """
     return extent * ((2.0 * torch.arange(count, device=extent.device) + 1.0) / count - 1.0)
 
@@ -62,7 +62,7 @@ def grid(count: tuple[int, int], extent: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def weights(shown: TileVisibility, rows: Tensor, count: tuple[int, int]) -> Tensor:
-    """Compute the largest blending weight [n, count_v, count_u] at the points of `grid`; 0 without residual."""
+    """Compute the largest blending weight [n, count_v, count_u] at the points of `grid`; 0 below the weight bound."""
     u, v = grid(count, shown.extent[rows])
     rest = 1.0 - (u.square() + v.square()) / SUPPORT**2
     weight = shown.opacity[rows, None, None] * rest.clamp(min=1e-12) ** shown.beta[rows, None, None]
@@ -70,8 +70,8 @@ def weights(shown: TileVisibility, rows: Tensor, count: tuple[int, int]) -> Tens
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
-    """Compute the root mean square of difference [n, C, v, u] times weight [n, v, u] where not 0, 8-bit steps: [n].
-    Alpha, the fourth of four channels, counts by `ALPHA_CONTRAST`."""
+    """Compute the root mean square [n], in 8-bit steps, of difference [n, C, v, u] times weight [n, v, u], over texels
+    of weight above 0. Alpha, the fourth channel if there is one, is scaled by `ALPHA_CONTRAST`."""
     count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
     squares = difference[:, :3].square().sum(1)
     if difference.shape[1] == 4:
@@ -124,7 +124,7 @@ def read_at(texels: Tensor, size: tuple[int, int]) -> Tensor:
 
 @torch.no_grad()
 def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress) -> Tiles:
-    """Resample every tile to the smallest grid within the tolerance; no tile where one colour is.
+    """Resample every tile to the smallest grid within the tolerance; drop the tile where one colour is within it.
 
     The error of a grid is (reconstruction - what the tile should hold) times the largest blending weight that a
     fragment has there, in 8-bit steps: its root mean square over the colour channels and over the part of the support
@@ -160,17 +160,17 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
 
 
 def _constant(values: Tensor, weight: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-    """Find the nearest constant [n, C] to tiles [n, C, v, u], and if it is within the tolerance [n] bool."""
+    """Find the nearest constant [n, C] to tiles [n, C, v, u], and whether it is within the tolerance, [n] bool."""
     square = weight.square()[:, None]
     constant = (values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)
     return constant, weighted_rms(values - constant[:, :, None, None], weight) <= tolerance
 
 
 def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
-    """Find the smallest grid of each tile [n, C, v, u]: pairs of size and rows.
+    """Find the smallest grid within the tolerance for each tile [n, C, v, u]: pairs of size and rows.
 
-    The errors of coarsening along u alone and along v alone, added in squares, predict that of both. Only grids that
-    are promising by that are tried.
+    The root of the summed squares of the errors of coarsening along u alone and along v alone predicts that of both.
+    Only grids whose prediction is near the tolerance or below are tried.
     """
     count, limit_v, limit_u = len(values), *values.shape[2:]
     limits = (limit_u, limit_v)

@@ -1,4 +1,4 @@
-"""Fine-tuning of an atlas against the photographs: texels alone; geometry, opacity and view colours stand still."""
+"""Fine-tuning of an atlas against the photographs: texels alone; geometry, opacity and view colours stay fixed."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.schedules import falling
 from bitymi_ns.train.views import MemoryBudget, View, training_order
 
-TO_START = 0.93  # share of the bytes that coded texels may have before their last steps, in which they grow a little
-TO_FILL = 0.99  # share of the bytes that they are to have after these steps, where they fill them
+TO_START = 0.93  # share of the byte limit for coded texels before the last steps, in which they grow a little
+TO_FILL = 0.99  # share of the byte limit that the last steps aim at, where it is to be used up
 
 
 @dataclass(frozen=True)
@@ -37,13 +37,13 @@ class Coded:
 
 
 class Cosines:
-    """The codes of a compact bundle, of no more bytes than the options say."""
+    """Coder of texels for a compact bundle, within the options' limit of bytes."""
 
     def __init__(self, coder: TexelCoder, options: TexelCodeOptions) -> None:
         self._coder, self._most, self._fill = coder, options.most_bytes, options.fill
 
     def first(self, texels: Tensor) -> Coded:
-        """Code texels [T, 3] before the steps."""
+        """Code the initial texels [T, 3]."""
         if self._most is None:
             return self._coded(texels, self._coder.code(texels))
         if self._fill:
@@ -58,7 +58,7 @@ class Cosines:
         return self._coded(texels, codes)
 
     def last(self, coded: Coded) -> Coded:
-        """Code the best texels."""
+        """Return the best codes, coded again if they exceed the limit."""
         if self._most is None or coded.stored.nbytes() <= self._most:
             return coded
         return self._coded(coded.listed, self._coder.fit(coded.texels, self._most, rounds=1))
@@ -68,13 +68,13 @@ class Cosines:
 
 
 class Pages:
-    """An atlas in the format of the bake's options, in the range of values of the texels that come first."""
+    """Encoder of an atlas in the format of the bake's options; the range of values is that of the initial texels."""
 
     def __init__(self, baked: BakeState) -> None:
         self._baked, self._range = baked, None
 
     def first(self, texels: Tensor) -> Coded:
-        """Encode the start, see `Cosines.first`."""
+        """Encode the initial texels, see `Cosines.first`."""
         self._range = None
         coded = self.again(texels)
         self._range = coded.stored.range
@@ -89,7 +89,7 @@ class Pages:
         return Coded(texels.clone(), drawn, atlas)
 
     def last(self, coded: Coded) -> Coded:
-        """Return what is stored, see `Cosines.last`."""
+        """Return the best atlas as it is, see `Cosines.last`."""
         return coded
 
 
@@ -98,7 +98,7 @@ class TuneOptions(TexelSteps):
     """Options of the fine-tuning."""
 
     rate: Positive = TexelSteps.rate
-    steps: Count = 400  # Steps, before the texels are stored; each stopping at one training view.
+    steps: Count = 400  # Steps before the texels are coded; each renders one training view.
     ssim_weight: Share = 0.2  # Share of 1 - SSIM in the loss; the rest is L1.
     val_every: Count = 8
     """Spacing of the validation views; the texels that show these best are kept. 0: none, and the last texels are kept,
@@ -108,20 +108,20 @@ class TuneOptions(TexelSteps):
     cache_bytes: NonNegativeInt = 1_000_000_000
     """Memory for the fragments of the views, first of the validation views, which are drawn most often; what does not
     fit is traced again whenever it is needed."""
-    seed: int = 0  # Of the order of the views.
+    seed: int = 0  # Seed of the order of the views.
     coded_steps: Count = 120
     """Further steps, which draw the texels as stored: blocks of BC7, or the codes of a compact bundle."""
     coded_every: PositiveCount = 10  # Steps between codings of the texels.
-    coded_rate: float = 0.02  # Their rate at the start.
+    coded_rate: float = 0.02  # Rate of these further steps at the start.
 
     @classmethod
     def of_learned(cls, steps: int, cache_bytes: int = cache_bytes) -> TuneOptions:
-        """Options for trained texels: all views train, and all steps draw what is stored. Half the rate takes twice the
-        steps."""
+        """Make options for trained texels: all views train, and all steps draw the texels as stored, at twice the rate,
+        because half of it would need twice the steps."""
         return cls(steps=0, coded_steps=steps, coded_rate=2 * cls.rate, val_every=0, cache_bytes=cache_bytes)
 
     def check(self) -> None:
-        """Check the values."""
+        """Check the values; raise ValueError for one out of range."""
         check_ranges(self)
         if self.val_every == 1:
             raise ValueError("val_every must not be 1: no view would be left to learn from")
@@ -146,18 +146,18 @@ def tune_atlas(
     validation views best are kept, or the baked ones if none are better.
 
     Args:
-        baked: a bake with an atlas; reduced tiles, extents and constants are tuned as they are.
+        baked: a bake with tiles, which keep their sizes; constants of surfels without a tile are tuned, too.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene.
-        eval_views: views of which the gain is stated, of what is stored; they decide nothing.
+        eval_views: held-out views on which the gain of the stored texels is measured; they decide nothing.
         coding: how texels are coded, where the surfels are rounded for a compact bundle. The last steps then see what
             the coding makes of the texels, and the codes that show the validation views best are kept.
         device: where the texels learn. Photographs and cameras may be on another one: each view is copied when it is
             traced.
 
     Returns:
-        a new bake, encoded, with `statistics.finetune`; `baked` itself without change where there are fewer than 4
-        views.
+        a new bake, encoded, with `statistics.finetune`; the texels stay as they are if there are fewer than
+        `FEWEST_VIEWS` views (without validation, none).
     """
     options = options or TuneOptions()
     options.check()
@@ -168,7 +168,7 @@ def tune_atlas(
     budget = MemoryBudget(options.cache_bytes)
     held_back, trained = validation_split(views, options.val_every)
     validation, tuned = (TuningViews(texels, part, background, budget) for part in (held_back, trained))
-    before = validation.psnr(texels.values, progress)  # first: these views are kept first
+    before = validation.psnr(texels.values, progress)  # before others: the cache is filled in this order
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)
     covered = texels.coverage(trained, progress) if baked.coverage is None else baked.coverage.to(device)
     share = 1.0 / (covered[:, 0] + options.prior)  # [T]
@@ -202,13 +202,13 @@ def _descend(
     options: TuneOptions,
     progress: Progress,
 ) -> None:
-    """Move texels [T, 3] by their shares [T], and evaluate the validation views."""
+    """Run the steps on texels [T, 3] in place, with step sizes `share` [T], and evaluate the validation views."""
     for step in range(options.steps):
         rate = falling(options.rate, step, options.steps)
         views.step(training_order(len(views), options.seed, step), texels, share, rate, options.ssim_weight)
         progress("tuning texels", step + 1, options.steps)
         if stopping.due(step + 1) and not stopping.update(step + 1, validation.psnr(texels), texels.clone):
-            progress("tuning texels", step + 1, step + 1)  # no more is to come
+            progress("tuning texels", step + 1, step + 1)  # completes the bar
             break
 
 
@@ -222,7 +222,7 @@ def _coded(
     progress: Progress,
 ) -> Coded:
     """Optimise texels [T, 3] through their coding: the image is that of the stored texels, and its gradient moves the
-    texels behind them. Returns the coded texels that show the validation views best."""
+    uncoded ones. Return the coded texels that show the validation views best."""
     coded = coding.first(texels.cpu())
     texels = coded.texels.to(texels.device, copy=True)
     psnr = validation.psnr(texels, progress)

@@ -69,8 +69,8 @@ class BakedScene:
         transmittance_min: a pixel ends at the surfel, not blended itself, that would leave less transmittance; 0: no
             limit. Training uses 1e-4; `FAST` is faster and changes a pixel by at most half an 8-bit step. WebGPU always
             uses 1e-4.
-        photographed: [P, 4] float32 on the CPU, points of the scene and the pixels per unit of length in their
-            photographs, to choose the sampling of a view (`sampling.py`); None: as for the photographs' scale.
+        photographed: [P, 4] float32 on the CPU, points of the scene and their resolution in the photographs, pixels per
+            world unit, to choose the sampling of a view (`sampling.py`); None: as at the photographs' scale.
         through_webgpu: render through WebGPU (`ops.webgpu`) on any device; images are then on the CPU.
     """
 
@@ -102,8 +102,8 @@ class BakedScene:
         return self._values(slice(3)) * self.scale + self.offset
 
     def alphas(self) -> Tensor | None:
-        """Compute the factors m of sigma of the atlas, [layers, height, width] float32; None if there is no atlas or
-        its texels are opaque.
+        """Compute the atlas's factors m of sigma, [layers, height, width] float32; None if there is no atlas or its
+        texels are opaque.
 
         Raises:
             ValueError: there are only the atlas's BC7 blocks.
@@ -130,7 +130,7 @@ class BakedScene:
         return replace(self, surfels=surfels, tiles=self.tiles.to(device), **optional)
 
     def only(self, kept: Tensor) -> BakedScene:
-        """Leave out surfels, those for which `kept` [N] is False; texels and terms of view colours stay."""
+        """Keep the surfels for which `kept` [N] is True; texels and terms of view colours stay."""
 
         def some(t: Tensor | None) -> Tensor | None:
             return None if t is None else t[kept.to(t.device)]

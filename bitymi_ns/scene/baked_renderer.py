@@ -20,7 +20,7 @@ class BakedRenderer:
 
     Args:
         scene: on a CUDA device.
-        width, height: of the images, pixels.
+        width, height: image size, pixels.
         views: number of views per frame.
         images: names of `ops.baked.IMAGES`: fewer images cost less.
         background: [3] colour behind the scene; None: black.

@@ -22,12 +22,12 @@ SAMPLE = 0.58
 """Minimum number of samples across a photograph's pixel at smaller scales, within the limits below. Coarser samples
 blur edges that the alpha texels of several surfels share: the mean transmittance of a stack is not the product of the
 means."""
-MOST_SAMPLES, FEW_PIXELS = 6, 1 << 21  # maximum per pixel along each axis; more where the view has fewer samples in all
+MOST_SAMPLES, FEW_PIXELS = 6, 1 << 21  # maximum per pixel along each axis; more up to this number of samples in all
 MOST_PIXELS = 1 << 24  # maximum number of samples of a view
 FARTHEST = (1.0 / 64, 64.0)  # range of scales
 RIM = 3  # pixels around discs that the low pass and widened kernels may reach
 
-Part = tuple[int, int, int, int]  # of an image: left, top, right, bottom in pixels, the last two exclusive
+Part = tuple[int, int, int, int]  # part of an image: left, top, right, bottom in pixels, the last two exclusive
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Sampling:
     Attributes:
         samples: per pixel along each axis.
         photo_pixel: side of a photograph's pixel in samples (csrc/core/resize.h).
-        part: that is rendered, as surfels reach no other pixels; None = the whole view.
+        part: rendered part of the view: surfels reach no other pixels; None = the whole view.
     """
 
     samples: int = 1
@@ -141,7 +141,7 @@ def padded(image: Tensor, part: Part, size: tuple[int, int], around: Tensor | No
     Args:
         image: [views, rows, columns, channels] of the part.
         size: height and width of the views.
-        around: [channels] the padding; None = 0.
+        around: [channels] value of the padding; None = 0.
     """
     left, top, right, bottom = part
     whole = image.new_zeros(len(image), *size, image.shape[-1])

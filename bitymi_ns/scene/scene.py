@@ -45,7 +45,7 @@ class RenderOutput:
     """A rendered view.
 
     Attributes:
-        rgb: [H, W, 3] colour over the background, linear in the images' own scale, not clamped.
+        rgb: [H, W, 3] colour over the background, encoded as in the photographs, not clamped.
         alpha: [H, W, 1] coverage.
         beta: [H, W, 1] sum of w beta, the paper's alpha-blended Beta value.
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
@@ -137,8 +137,8 @@ class Scene(nn.Module):
         """Resize surfel parameters and texels for a state that is loaded next.
 
         Args:
-            state: of a scene of the same configuration.
-            prefix: of the names in `state`.
+            state: state of a scene of the same configuration.
+            prefix: prefix of the names in `state`.
         """
         n = len(state[f"{prefix}surfels.means"])
         for parameter in self.surfels.values():
@@ -208,7 +208,7 @@ class Scene(nn.Module):
         return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)
 
     def _unlisted_texture(self, field_mode: Literal["train", "frozen", "off"]) -> dict[str, Any] | None:
-        """Return the texels' keywords of `rasterize_image`; None if views need fragment lists."""
+        """Return the texel arguments of `rasterize_image`, {} without texels; None if views need fragment lists."""
         if self.config.max_fragments or not can_rasterize(self.surfels["means"].device):
             return None
         if self.field is None or field_mode == "off":
@@ -225,7 +225,7 @@ class Scene(nn.Module):
         """Draw a view and compare it with its photograph, see `ops.training_view`; None if views need fragment lists.
 
         Args:
-            correction: of the photograph, [3] or [3, 4], see `train.views.View`.
+            correction: colour correction, [3] or [3, 4], see `train.views.View`.
             field_mode: as in `render`.
         """
         texture = self._unlisted_texture(field_mode)

@@ -92,7 +92,7 @@ def nyquist_resolution(
 
 
 def seen_sides(pixels: Tensor, r_min: int = 4, r_max: int = 64) -> Tensor:
-    """Compute tile resolutions by the training views' resolution alone.
+    """Compute tile resolutions from the training views' resolution alone.
 
     Args:
         pixels: [N, 2] largest projected extent of the tile over the training views.

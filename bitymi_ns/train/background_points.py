@@ -21,8 +21,8 @@ NEAREST, FARTHEST = 1.2, 5.0
 FEW = 10  # photographs with fewer points use the median depth of the others
 RADIUS = 0.5  # largest initial scale, in cells
 OPAQUE = 0.5  # minimum mean alpha of a cell
-SUPPORT = 8  # minimum number of photographs with the point in an empty cell: with fewer, 17 photographs overfit
-IN_FRONT = 0.2  # maximum ratio of photographs with the point in front of a cell's points to photographs as above
+SUPPORT = 8  # minimum number of photographs with the point in an empty cell: with fewer, a run on 17 overfitted
+IN_FRONT = 0.2  # maximum number of photographs with the point in front of a cell's points, per such photograph
 
 
 class BackgroundPoints(NamedTuple):
@@ -45,7 +45,7 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
     Args:
         points: [M, 3] world positions; non-finite ones are ignored.
         views: training photographs at full size.
-        seed: of the random pixels, depths and order.
+        seed: seed of the random pixels, depths and order.
 
     Returns:
         float32 on the CPU; empty if no photograph shows a point.

@@ -138,7 +138,7 @@ class TexelConfig(TexelSteps):
     surfel_rates: Positive = 0.4
     """Surfel rates in the texel stage, as a share of the rates of a run of the stage's length; cosine decay to 0."""
     mean_rates: Positive = 0.2
-    """Position rates in the texel stage, likewise: `surfel_rates` would destroy the existing image."""
+    """Position rates in the texel stage, likewise; as high as `surfel_rates`, they would destroy the existing image."""
     pixels_per_texel: Positive = 0.25
     """Pixels of a surfel (summed blending weight, in the view where it covers most) per texel of its tile, at least."""
     rendered_pixels_per_texel: Positive = 32.0
@@ -152,7 +152,7 @@ class TexelConfig(TexelSteps):
 class GuardConfig:
     """Rollback of diverged training."""
 
-    rollbacks: Count = 5  # Most rollbacks to the last good state; 0 = a loss that is not finite ends the run.
+    rollbacks: Count = 5  # Maximum number of rollbacks; 0 = a loss that is not finite ends the run.
     rates: PositiveShare = 0.3
     """Factor of all learning rates after a rollback; its square, cube, ... if further rollbacks follow without a good
     window between them."""
@@ -180,7 +180,7 @@ class TrainConfig:
     lr: LearningRates = field(default_factory=LearningRates)
     guard: GuardConfig = field(default_factory=GuardConfig)
     texels: TexelConfig = field(default_factory=TexelConfig)
-    freeze_after: Count = 5000  # From this step on, the texture field is trained in one step of `freeze_every` only.
+    freeze_after: Count = 5000  # From this step on, only every `freeze_every`-th step trains the texture field.
     freeze_every: PositiveCount = 10
     """Interval of the steps that train the texture field after `freeze_after`; 1 = every step."""
     freeze_min_updates: Count = 300
@@ -190,8 +190,8 @@ class TrainConfig:
     """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Runs
     of fewer than 3,000 steps with a texel stage use a longer interval, but reach full size before that stage."""
     small_photograph: PositiveCount = 10_000
-    """Number of opaque, unmasked pixels per photograph up to which that interval is not stretched; n times as many
-    stretch it by at most sqrt(n)."""
+    """Number of opaque, unmasked pixels per photograph up to which short runs do not lengthen the interval of
+    `resolution_schedule`; n times as many lengthen it by a factor of at most sqrt(n)."""
     num_downscales: Annotated[int, Field(ge=0, le=16)] = 2  # Halvings of the image size at the start.
     init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1  # Initial opacity of the surfels.
     first_surfels: PositiveCount | None = None

@@ -41,9 +41,9 @@ def evaluate(
 
     Args:
         views: at full size; each is read once.
-        poses: of a run that refined them: views are also evaluated with the corrections of the nearest photographs,
-            and with poses then aligned to the scene.
-        exposure: of the run: if it corrects photographs, views get corrections interpolated from theirs.
+        poses: poses of a run that refined them: views are also evaluated with the corrections of the nearest
+            photographs, and with poses then aligned to the scene.
+        exposure: if it corrects the run's photographs, views get corrections interpolated from theirs.
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)

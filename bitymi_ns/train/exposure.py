@@ -1,6 +1,6 @@
 """Exposure and white balance of the training photographs: a learned colour correction per photograph.
 
-A photograph maps the scene's colour c to gain c, with a gain per channel, or to matrix c + offset. Corrections are
+A photograph maps the scene's colour c to gain * c, with a gain per channel, or to matrix @ c + offset. Corrections are
 relative to the mean photograph: after every step log gains and other entries are shifted to sum to zero over the
 photographs, so that they do not tint the scene. They are not part of the scene: a free camera shows the mean exposure;
 `Exposure.at` interpolates that of a held-out photograph.
@@ -36,8 +36,8 @@ class Exposure:
     """Colour corrections of a run.
 
     Attributes:
-        table: [V, 3] log gains; for affine corrections [V, 12], the rows of [matrix | offset] with log gains on the
-            diagonal. None: no corrections.
+        table: [V, 3] log gains of V photographs; for affine corrections [V, 12], the rows of [matrix | offset] with log
+            gains on the diagonal. None: no corrections.
         decided: True once `start` was called or a state loaded.
         reason: why photographs are corrected or not; empty until decided.
     """
@@ -165,7 +165,7 @@ class Exposure:
 
         Args:
             rate: learning rate of log gains and other entries.
-            processes: of the run, whose views the step averages over.
+            processes: processes whose views the step averages over.
         """
         learning, self._learning = self._learning, []
         if self.table is None or self._moments is None:
@@ -233,7 +233,7 @@ class Exposure:
         Args:
             state: None: saved before corrections existed. Then, and after `off`, `auto` makes none.
             count: number of training views.
-            device: of the corrections; None: that of `state`.
+            device: device for the corrections; None: that of `state`.
         """
         if state is None or (self.kind == "auto" and state["kind"] == "off"):  # corrections do not begin midway
             self.decided = self.kind in ("off", "auto")
@@ -268,8 +268,8 @@ def corrected(
     """Add the final corrections of a run to its training views.
 
     Args:
-        views: of the run, at full size.
-        state, files: of its `Exposure`; state None: no corrections.
+        views: the run's training views at full size.
+        state, files: state and files of its `Exposure`; state None: no corrections.
 
     Raises:
         ValueError: the number of photographs differs from the run's.

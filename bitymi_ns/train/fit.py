@@ -51,7 +51,7 @@ class TrainLog:
 
     entries: list[LogEntry] = field(default_factory=list)
     events: list[dict[str, float]] = field(default_factory=list)  # Reports of the strategy, each with its `step`.
-    cameras: list[Camera] = field(default_factory=list)  # Of the training views, with refined poses if any.
+    cameras: list[Camera] = field(default_factory=list)  # Training cameras, with refined poses if any.
 
 
 class Trainer:

@@ -23,7 +23,7 @@ BETA_RAW = 2.0  # nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.
 MAX_SCALE = 0.25
 """Largest initial scale, as a share of the larger of scene extent and distance to the nearest camera."""
 PIXELS_PER_FIRST_SURFEL = 1000  # minimum number of pixels rendered in a run per initial surfel
-FEWEST_FIRST = 5000  # points used in runs of any length
+FEWEST_FIRST = 5000  # lower bound of the limit on initial surfels, in runs of any length
 MIN_SCALE = 1e-6  # smallest initial scale, as a share of the scene extent
 SAMPLE = 4096  # random surfels whose visibility is tested first: nearly all views see one of them
 CHUNK = 1 << 20  # surfels tested at a time after that

@@ -39,7 +39,7 @@ def objective(
         output: rendered view of H x W pixels; with `soft_overdraw` if the overdraw loss is on.
         target: [H, W, 3] photograph at the same size, over the same background.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
-        depth, normal: of the view, see `View`; used if the view was rendered with maps.
+        depth, normal: maps as in `View`; used if the view was rendered with maps.
 
     Returns:
         `photometric`; `falloff` unless its weight is 0; `overdraw` if the view was rendered with `soft_overdraw`;
@@ -66,7 +66,7 @@ def objective(
 
 
 def fused_losses(config: LossConfig, image: Tensor) -> bool:
-    """Return True if kernels compute the losses of an image [H, W, C]."""
+    """Return True if fused CUDA kernels compute the losses of an image [H, W, C]."""
     return config.ssim_weight > 0.0 and min(image.shape[:2]) >= SSIM_WINDOW and cuda_backend(image.device)
 
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 EPS = 1e-15  # Adam's epsilon
 BETAS = (0.9, 0.999)  # Adam's betas of surfel parameters
-FIELD_BETAS = (0.9, 0.99)  # of the texture field, whose gradients are sparse, and large early on
+FIELD_BETAS = (0.9, 0.99)  # those of the texture field, whose gradients are sparse, and large early on
 
 
 def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = BETAS) -> Adam:
@@ -57,12 +57,12 @@ class _Row(NamedTuple):
     rate: float
     betas: tuple[float, float]
     eps: float
-    factors: Tensor | None  # [N], of the rows' updates
+    factors: Tensor | None  # [N], of the updates of the parameter's rows
 
 
 @torch.no_grad()
 def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> None:
-    """Step all optimisers like calling each `step`, and scale the updates of single rows.
+    """Step all optimisers, as calling each one's `step` would, and scale the updates row by row.
 
     Each Adam.step costs 100-200 us of Python, ten times the GPU work. Fused Adam optimisers are therefore stepped
     together: on the CPU by one call per learning rate, bit-identical to each `step`, on CUDA devices by one kernel.
@@ -223,7 +223,7 @@ def replace_rows(
 def cap_opacity(
     surfels: Mapping[str, Parameter], optimizers: Mapping[str, Optimizer], highest: float, forget_all: bool = False
 ) -> int:
-    """Clamp opacities to at most `highest`, in place, and reset their optimiser state, or that of all rows.
+    """Clamp opacities to at most `highest`, in place, and reset the optimiser state of those lowered, or of all rows.
 
     The old momentum would raise the opacities again at once.
 

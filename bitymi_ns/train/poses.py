@@ -69,7 +69,7 @@ def pose_step(gradient: Tensor, projection: Projection, pixels: float) -> Tensor
 
     Args:
         gradient: [6] float64 of the loss with respect to a motion as in `moved`.
-        projection: of the view.
+        projection: projection of the view, after the backward pass.
         pixels: image motion if all fragments agree on the direction.
 
     Returns:
@@ -113,7 +113,7 @@ class Poses:
     def __init__(self, schedule: Schedule, cameras: Sequence[Camera]) -> None:
         """
         Args:
-            cameras: of the training views at full size, with the poses of the capture.
+            cameras: training cameras at full size, with the poses of the capture.
         """
         self.schedule = schedule
         self.motions: Tensor | None = None
@@ -163,7 +163,7 @@ class Poses:
         """Update the poses of a step's views, after the backward passes.
 
         Args:
-            projections: of the views, in the order of the calls of `learning`.
+            projections: one per view, in the order of the calls of `learning`.
             pixels: see `pose_step`.
         """
         learning, self._learning = self._learning, []
@@ -252,7 +252,7 @@ def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: fl
     Args:
         view: on the scene's device, at full size.
         background: [3] colour behind the scene; None: black.
-        ssim_weight: of the photometric loss.
+        ssim_weight: SSIM weight of the photometric loss.
     """
     target = view.target(background, scene.surfels["means"].device)
 

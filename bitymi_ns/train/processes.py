@@ -56,7 +56,7 @@ class Processes:
         start = step * self.views + self.rank * self.each
         return range(start, start + self.each)
 
-    # equal inputs of decisions
+    # inputs of decisions, made equal in all processes
 
     def any(self, condition: bool) -> bool:
         """Return True if the condition holds in any process."""

@@ -123,7 +123,7 @@ class Schedule:
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
 
     def lists_fragments(self, maps: bool) -> bool:
-        """Return True if some steps need fragment lists also on a GPU: for the overdraw, depth or normal loss.
+        """Return True if some steps need fragment lists even on a GPU: for the overdraw, depth or normal loss.
 
         Args:
             maps: some views have depth or normals.

@@ -112,7 +112,7 @@ def removal_errors(
 
     Args:
         views: at the resolution to compare at.
-        seed: of the signs and of random backgrounds.
+        seed: seed of the signs and of random backgrounds.
         processes: each renders its share of the views.
 
     Returns:

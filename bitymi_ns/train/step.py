@@ -112,7 +112,7 @@ class Training:
         """
         Args:
             scene: changed in place.
-            optimizers: by surfel parameter name, and those of the field.
+            optimizers: by surfel parameter name, and `field_table` and `field_mlp` for a hash field.
             max_steps: length of the run; the schedules depend on it.
             on_resize: called with the name and the new Parameter when a surfel parameter is replaced.
             announce: called with a sentence on each rollback and whenever surfels are dropped.
@@ -152,7 +152,8 @@ class Training:
         return view._replace(camera=self.poses.learning(index, view.camera, self.step), correction=correction)
 
     def begin(self, step: int) -> None:
-        """Start the clock and set the learning rates of a step."""
+        """Start a step and its clock, with the exposure corrections or the texel stage if they are due, and set the
+        learning rates."""
         if not self._synchronised:  # before the clock starts: waiting for other processes is no training time
             self.processes.broadcast_(self.scene.state_dict().values())
         self.clock.start()

@@ -49,7 +49,7 @@ SPLIT_OPACITY = 0.9  # opacity of the halves relative to the surfel's: they over
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
 """Number of views on which the error prune measures removals, as a share of the run's steps, and its minimum."""
 NO_BAD_PIXEL = 0.1  # added to counts of bad pixels when parents are sampled, so that surfels without any have a chance
-FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # the same for each of the four final prunes
+FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # as `ERROR_VIEWS`, for each of the four final prunes
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 
@@ -83,7 +83,7 @@ class Strategy:
         self.schedule = schedule
         self.on_resize = on_resize
         self.most = most_surfels(self.config, image_pixels, first_surfels)
-        # fainter than at the start, and faint enough for a final prune
+        # opacity below which a surfel may be replaced: fainter than at the start, and faint enough for a final prune
         self._replaceable = min(self.config.densify.final_prune_opacity, 0.5 * self.config.init_opacity)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         self.statistics = torch.zeros(len(STATISTICS), 0)

@@ -24,16 +24,16 @@ class View(NamedTuple):
     """One photograph.
 
     Attributes:
-        camera: of the full-size image.
+        camera: camera of the full-size image.
         image: [H, W, 3] or, with straight (not premultiplied) alpha, [H, W, 4]; float in [0, 1] or uint8.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
-        correction: maps the scene's colour c to the photograph's: gains [3], gain c, or [3, 4], matrix c + offset;
-            None: no correction.
+        correction: maps the scene's colour c to the photograph's: [3] gain, gain * c; or [3, 4] matrix and offset,
+            matrix @ c + offset; None: no correction.
         depth: [H, W] or [H, W, 1] float, camera z in world units, 0 or NaN where unknown; None: unknown everywhere.
         normal: [H, W, 3] float, surface normals in the camera frame (OpenCV axes, facing the camera), 0 or NaN where
             unknown; None: unknown everywhere.
         counted: number of True pixels of `mask`; None: not known.
-        file: of the photograph; None: not known.
+        file: file of the photograph; None: not known.
     """
 
     camera: Camera
@@ -76,7 +76,7 @@ class TrainingData:
         covered: share of opaque, unmasked pixels (`covered_share`).
         exif_stops: log2 exposure of each view (`capture.exif.exif_stops`), NaN: unknown; None: unknown for every view.
         files: photograph of each view, which views may share; None: one view per photograph.
-        cameras: of the views; None: taken from the views, which may read the photographs for it.
+        cameras: cameras of the views; None: taken from the views, which may read the photographs for it.
     """
 
     views: Sequence[View]
@@ -111,7 +111,7 @@ def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Ten
 
     Args:
         rgb: [H, W, 3] over the background.
-        correction: of the photograph, see `View`; None: returns `rgb`.
+        correction: as in `View`; None: returns `rgb`.
         alpha: [H, W, 1] coverage.
         background: [3]; None: black.
     """
@@ -227,7 +227,7 @@ class DownscaledViews:
 
     Args:
         views: at full size.
-        device: of the images returned.
+        device: device of the returned images.
         correction: returns the current correction of a view by its index; None: the view's own.
         pose: returns a view's camera, by its index, with the current pose; None: poses are fixed.
         resident_bytes: budget on a CUDA device; None: `photograph_budget`.
@@ -302,7 +302,7 @@ def photograph_budget(device: torch.device) -> int:
 
 
 def training_order(n: int, seed: int, step: int) -> int:
-    """Compute the index of a training step's view: each view once per epoch, reshuffled each epoch.
+    """Compute the index of the view at position `step` of the training order: each view once per epoch, reshuffled.
 
     Depends only on the arguments, so that a resumed run uses the same views.
     """

@@ -1,5 +1,6 @@
-// bitymi_ns._cpu, or a module of another name for another CPU. Operations take the arguments of their struct (csrc/ops)
-// by keyword; the caller allocates; shapes and dtypes are checked here (reader.h), values in Python.
+// Module bitymi_ns._cpu, or one of another name for other CPU features. Operations take the fields of their struct
+// (csrc/ops) as keyword arguments; the caller allocates; shapes and dtypes are checked here (reader.h), values in
+// Python.
 #include <nanobind/stl/optional.h>
 
 #include "bindings/reader.h"
@@ -55,7 +56,7 @@ template <class Arguments> void bind_operation(nb::module_& m, const std::string
   });
 }
 
-// Pages of an atlas before gathering.
+// Pages of an atlas, to be gathered into Patches.
 struct Pages {
   const uint8_t* bytes;
   const float* floats;

@@ -170,7 +170,7 @@ class Reader {
     if (!nb::try_cast(find(name), value)) wrong(name, "three numbers");
     to[0] = S(std::get<0>(value)), to[1] = S(std::get<1>(value)), to[2] = S(std::get<2>(value));
   }
-  // Reads more of one kind: name, target, name, target.
+  // Reads several arguments of one kind: name, target, name, target, ...
   template <class... More> void numbers(const char* name, More&... more) {
     each([this](const char* n, auto& to) { number(n, to); }, name, more...);
   }

@@ -7,7 +7,7 @@
 
 namespace bt {
 
-// Rates of one step, which is the step-th: rate / (1 - beta1^step), 1 / sqrt(1 - beta2^step).
+// Coefficients of step number `step`, from 1: rate / (1 - beta1^step), root = 1 / sqrt(1 - beta2^step).
 template <class S> struct AdamRates {
   S rate, root, beta2, keep1, keep2, eps;
 };
@@ -20,7 +20,7 @@ template <class S> BT_HD AdamRates<S> adam_rates(double rate, double beta1, doub
           S(eps)};
 }
 
-// Advances both moments by the gradient; returns what the parameter moves by.
+// Updates both moments by the gradient; returns the change of the parameter.
 template <class S> BT_HD S adam_step(const AdamRates<S>& r, S gradient, S& mean, S& square) {
   mean += r.keep1 * (gradient - mean);
   square = r.beta2 * square + r.keep2 * gradient * gradient;

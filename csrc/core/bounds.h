@@ -19,7 +19,7 @@ template <class T> struct ExtentOf : Outline<T> {
   // qa x^2 + 2 qb x y + qc y^2 + 2 qd x + 2 qe y + qf <= 0
 };
 using Extent = ExtentOf<double>;
-// Calls fn(number of a, number of b) for all numbers of two extents.
+// Calls fn(member of a, member of b) for all numeric members of two extents.
 template <class A, class B, class F> BT_HD void each_number(A& a, B& b, F&& fn) {
   fn(a.x0, b.x0), fn(a.x1, b.x1), fn(a.y0, b.y0), fn(a.y1, b.y1);
   fn(a.y_left, b.y_left), fn(a.y_right, b.y_right), fn(a.blur, b.blur);
@@ -180,7 +180,7 @@ template <class T> BT_HD TileSpan<T> tile_span(const Interval<T>& x, T c, int pi
   const T zero = T(0.0f), one = T(1.0f), size = T(double(pixels));
   const MaskOf<T> none = x.empty() | (zero > c + x.x1) | (c + x.x0 > size - one);
   const T first = floor_(max_(zero, c + x.x0) * T(1.0 / kTile));
-  const T last = floor_(-floor_(-min_(size, c + x.x1)) * T(1.0 / kTile));  // of the next whole number
+  const T last = floor_(-floor_(-min_(size, c + x.x1)) * T(1.0 / kTile));  // rounded up to a pixel first
   return {select(none, zero, first), select(none, -one, min_(last, T(double(tiles_across(pixels) - 1))))};
 }
 // Returns the rows of tiles of a surfel with radii above 0, i.e. whose box meets the image.

@@ -17,7 +17,7 @@ template <class S> struct FieldArrays {
   S mid[3], half;
   const S *table, *w1, *w2, *w3;  // [levels, 2^log2_size, 4], [4 levels, 16], [16, 16], [16, 3]
 
-  // First entry of a level; and numbers in all levels.
+  // Index of a level's first entry; count of the table's numbers.
   BT_HD int64_t first_entry(int level) const { return int64_t(level) << log2_size; }
   BT_HD int64_t table_size() const { return first_entry(levels) * kFeatures; }
   BT_HD uint32_t hash_mask() const { return (1u << log2_size) - 1u; }

@@ -11,8 +11,8 @@ constexpr int kBands = 4, kBandRows = kTile / kBands;  // of a tile
 // A row of geom up to kBeta with its level set.
 enum LevelColumn {
   kR2 = kBeta + 1,  // u^2 + v^2 <= r2
-  kBlur2,  // and d^2 <= blur2; 0: no visible low pass; -kArea if PixelKernel filters the surfel. With ResizedKernel
-           // also the height of the low pass, which falls to 1/255 there
+  kBlur2,  // and d^2 <= blur2; 0: no visible low pass; -kArea if PixelKernel filters the surfel. With ResizedKernel it
+           // also encodes the height of the low pass, which falls to 1/255 at blur2
   kLevelRow
 };
 // Fills the row; false if nothing of the surfel is visible.

@@ -19,7 +19,7 @@ template <class S> BT_HD S level_radius2(S level, S beta, S slack) {
 // Computes the radius in pixels where the low pass is exp(-level).
 template <class S> BT_HD S low_pass_radius(S level) { return sqrt_(level) + S(0.01); }
 
-// Returns true where the kernel of a row is nowhere below the low pass of squared radius `wide` and at most its height.
+// Returns true where the low pass of a row, of squared radius `wide`, nowhere exceeds the kernel.
 // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x), the
 // kernel (1 - x)^beta is at least exp(-d^2 / wide) out to d^2 / wide = ln 255 where k >= (beta + ln 255) wide. Up to
 // there the plane must lie beyond `near`, which clips the kernel only.

@@ -176,7 +176,7 @@ template <class S> struct DrawnSurfel {
   S bound;               // fragments of smaller weight get no residual
   S flat[4];             // residual and alpha without texels
   bool cut;              // whether any alpha differs from 1
-  S k;                   // texels per scale unit, over the texels along a side
+  S k;                   // 1 / side of the tile in scale units
   const Patches* level;  // null: no texels
   int64_t first;
   int32_t sides[2];

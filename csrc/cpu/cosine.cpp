@@ -1,4 +1,4 @@
-// Cosine transform of texel blocks: a lane per block and channel to coefficients, a lane per block back.
+// Cosine transform of texel blocks: forward with a lane per block and channel, inverse with a lane per block.
 #include "ops/cosine.h"
 
 #include "cpu/kernels.h"

@@ -11,8 +11,8 @@ namespace {
 // Numbers in the sums of all parts but the first, at most.
 constexpr int64_t kMostSums = int64_t(1) << 28;
 
-// Calls fn<Kernel>(sums, first tile, last tile) for parts of the tiles, and reduces the parts' `width` x `rows` sums to
-// `out`, to which the first part adds: reduce(to, from).
+// Calls fn(kernel, sums, tile) for every tile. Each part of the tiles has sums [rows, width] of its own; the first adds
+// to `out`, and reduce(to, from) adds a row of the others' to it.
 template <class S, class F, class Reduce>
 void each_part(const View<S>& view, Bins& bins, S* out, int64_t rows, int64_t width, F&& fn, Reduce&& reduce) {
   const auto lists = binner(view, bins);
@@ -77,7 +77,7 @@ template <class S> BT_HD void add_pair(Pair<S> pair, S* to) {
 template <class S> void texel_coverage(const TexelCoverage<S>& a) {
   using P = Lanes<S>;
   const auto add = [&](auto kernel, S* sums, int64_t tile) {
-    uint32_t counts[kBlocks];  // pixels of the blocks
+    uint32_t counts[kBlocks];  // masks of the blocks' pixels that count
     std::fill(counts, counts + kBlocks, ~uint32_t(0));
     if (a.mask)
       each_pixel(tile, a.view.width, a.view.height, [&](int64_t pixel, int block, int lane) {

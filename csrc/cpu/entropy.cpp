@@ -45,12 +45,12 @@ Token split(int64_t x, int direct) {
   return {int(2 * kind) - (x < 0), count, magnitude & mask};
 }
 
-// Returns the bits that follow a token.
+// Returns the number of bits that follow a token.
 int bits_after(int token, int direct) {
   const int kind = (token + 1) / 2, above = kind - (1 << direct);
   return above < 0 ? 0 : (above >> kFine) + direct - kFine;
 }
-// Returns the token for `direct` of the magnitudes with a token for kFinest.
+// Converts a token for kFinest to the token for `direct` of the same numbers.
 int coarser(int token, int direct) {
   const int kind = (token + 1) / 2, above = kind - (1 << kFinest), sign = token & 1;
   if (above < 0) return split(sign ? -kind : kind, direct).token;
@@ -62,8 +62,8 @@ int tokens_of(int direct) { return 2 * ((1 << direct) + ((kIntegerBits - direct)
 // Chooses a table by what precedes a number in its column.
 class Contexts {
  public:
-  // order: 0 = one table. Of blocks, 1 = by the running mean of the magnitudes of the block's earlier coefficients, 2 =
-  // by `others` as well. Else by the sum of the 1 or 2 numbers before.
+  // order: 0 = one table. In blocks, 1 = by the running mean of the magnitudes of the block's earlier coefficients, 2 =
+  // by `others` as well. In plain rows, by the sum of the previous number (1) or the previous two (2).
   Contexts(const IntegerColumn& column, int order, std::vector<int64_t> thresholds)
       : column_(column), order_(order), thresholds_(std::move(thresholds)) {
     if (column.blocks && order) means_.assign(column.blocks, 0);
@@ -106,7 +106,7 @@ void put(std::string& to, uint64_t x) {  // seven bits per byte, lowest first
 }
 void put_signed(std::string& to, int64_t x) { put(to, x < 0 ? 2 * (-uint64_t(x)) - 1 : 2 * uint64_t(x)); }
 
-// Frequencies of tokens that sum to kTotal, none of a token that occurs 0.
+// Scales counts of tokens to frequencies that sum to kTotal, at least 1 for every token that occurs.
 std::vector<uint32_t> normalised(const std::vector<uint32_t>& counts) {
   uint64_t sum = 0;
   for (uint32_t n : counts) sum += n;
@@ -168,7 +168,7 @@ Occurrences count(const IntegerColumn& column, const int64_t* values, int64_t ce
   }
   return found;
 }
-// Counts in all orders. Of blocks, contexts of an order are unions of those of the next.
+// Counts in all orders. In blocks, the contexts of an order are unions of those of the next.
 std::vector<Occurrences> count_all(const IntegerColumn& column, const int64_t* values, int64_t centre) {
   std::vector<Occurrences> found(column.blocks && !column.others ? 2 : kOrders);
   for (int order = int(found.size()) - 1; order >= 0; --order) {
@@ -186,7 +186,7 @@ std::vector<Occurrences> count_all(const IntegerColumn& column, const int64_t* v
   return found;
 }
 
-// Coding with a choice of `direct` and the order of `of`; keeps the bits it takes.
+// Coding with a choice of `direct` and the order of `of`; bits(): its size.
 class Attempt {
  public:
   Attempt(const IntegerColumn& column, int64_t centre, int direct, const Occurrences& of)
@@ -235,7 +235,7 @@ class Attempt {
     }
     if (count) plain += char(held);
     uint32_t state = kLowest;
-    for (size_t i = tokens.size(); i-- > 0;) {  // the decoder gets the last number first
+    for (size_t i = tokens.size(); i-- > 0;) {  // backwards: rANS decodes first what was coded last
       const uint32_t frequency = tables_[contexts[i]][tokens[i]], start = starts[contexts[i]][tokens[i]];
       for (; state >= ((kLowest >> kPrecision) << 8) * uint64_t(frequency); state >>= 8) coded += char(state);
       state = (state / frequency << kPrecision) + state % frequency + start;
@@ -292,7 +292,7 @@ class Bytes {
   const uint8_t *at_, *end_;
 };
 
-// Token of every slot of a table, its frequency and first slot.
+// Token of every slot of a table; frequency and first slot of every token.
 struct Slots {
   std::vector<uint16_t> tokens;
   std::vector<uint32_t> frequencies, starts;

@@ -8,15 +8,16 @@
 
 namespace bt {
 
-// A number of every row of a column.
+// Layout of a column, a number per row, and what precedes it.
 struct IntegerColumn {
   int64_t rows;
-  // Rows are coefficients of blocks: first coefficient 0 of every block, then coefficient 1, ... 0 = plain rows.
+  // Number of blocks whose coefficients are the rows: coefficient 0 of every block, then coefficient 1, ... 0 = plain
+  // rows.
   int64_t blocks;
   const uint8_t* others;  // [rows] sum of the magnitudes of this row's earlier numbers, at most 2; null without any
 };
 
-// Bytes that no encoder writes.
+// Thrown for bytes that no encoder writes.
 struct DamagedStream : std::runtime_error {
   using std::runtime_error::runtime_error;
 };

@@ -176,7 +176,7 @@ struct ListedIds {
 };
 void list_ids(const ListedIds& a);
 
-// Selects the fragments with keep [F] not 0. Writes their numbers, tile_start, block_start, and as many rows of blocks
+// Selects the fragments with keep [F] not 0. Writes their arrays, tile_start, block_start, and as many rows of blocks
 // as the last block_start.
 template <class S> struct SelectBlocks {
   TileBlocks layout;
@@ -234,7 +234,7 @@ template <class S> struct BakedForward {
   const S* base;  // [n, 3] f_view
   BakedResidual residual;
   const Patches* patches;
-  const Patches* coarser[kTileLevels - 1];  // levels of the tiles; null in views of the photographs' size
+  const Patches* coarser[kTileLevels - 1];  // half and quarter levels of the tiles; null at the photographs' size
   Bins* bins;
   bool maps;
   S* image;

@@ -193,7 +193,8 @@ template <class S> BT_HD void compress(S* to, Lanes<S> a, uint32_t lanes) { comp
 BT_HD void compress(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes(to, a, lanes); }
 template <class S> BT_HD void compress_only(S* to, Lanes<S> a, uint32_t lanes) { compress_lanes_only(to, a.v, lanes); }
 BT_HD void compress_only(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes_only(to, a, lanes); }
-// Stores them where memory up to `end` is written later anyway: masked stores cost dozens of operations on AMD.
+// Stores selected lanes where memory up to `end` is written later anyway: masked stores cost dozens of operations on
+// AMD.
 template <class T, class V> BT_HD void compress_until(T* end, T* to, const V& a, uint32_t lanes) {
   end - to >= kLanes ? compress(to, a, lanes) : compress_only(to, a, lanes);
 }

@@ -13,7 +13,7 @@
 
 namespace bt {
 
-// libgomp's threads spin for milliseconds after every parallel region, torch's and ours, unless OMP_WAIT_POLICY or
+// libgomp's threads spin for milliseconds after every parallel region, also torch's, unless OMP_WAIT_POLICY or
 // GOMP_SPINCOUNT are set. It reads these once, when torch loads it: too late for a plugin. But according to its manual
 // it spins a thousandth of that while a process has more OpenMP threads than processors. A second team of the missing
 // threads, which sleeps for good, achieves this. A process with one thread has none that spin, and one that uses few of

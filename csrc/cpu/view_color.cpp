@@ -25,12 +25,12 @@ template <class Kind, class S>
 constexpr bool kTogether = std::is_same_v<Kind, SphericalVoronoi> && std::is_same_v<S, float>;
 
 using P = Lanes<float>;
-// Up to 16 active surfels; the last one is repeated.
+// Up to 16 active surfels; lanes from `count` on repeat the last one.
 struct Together {
   int64_t ids[kLanes];
   int count = 0;
 
-  // Loads rows of numbers as lanes, and stores them.
+  // Loads the surfels' rows of `width` numbers, a surfel per lane; stores those of the first `count` lanes.
   void load_rows(const float* from, int64_t width, P* to) const {
     for (int lane = 0; lane < kLanes; ++lane)
       for (int64_t k = 0; k < width; ++k) to[k].set(lane, from[ids[lane] * width + k]);

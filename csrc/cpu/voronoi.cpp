@@ -151,7 +151,8 @@ template <class S> class SiteLanes {
       }
     }
   }
-  // The damped matrix is solved for the colours first, as theirs is small.
+  // Solves the damped system by its Schur complement: the colours are eliminated first, as their block is small and the
+  // same for each channel.
   void step(const P& damping) {
     P mean(S(0));
     for (int i = 0; i < linear_; ++i) mean += vv_[pair(i, i)];
@@ -205,7 +206,7 @@ template <class S> void rank_lanes(const RankSites<S>& a, int64_t first, std::ve
       const P *d = &samples[4 * s], *v = vectors + 3 * k;
       logits[s * sites + k] = d[0] * v[0] + d[1] * v[1] + d[2] * v[2];
     }
-  P left = P(S(sites * (sites - 1) / 2));  // sum of the numbers of the sites that are left
+  P left = P(S(sites * (sites - 1) / 2));  // sum of the indices of the sites left: at last that of one
   const auto put = [&](int place, const P& site) {
     for (int lane = 0; lane < count; ++lane) a.order[(first + lane) * sites + place] = int64_t(site[lane]);
   };
@@ -228,7 +229,7 @@ template <class S> void rank_lanes(const RankSites<S>& a, int64_t first, std::ve
       }
     }
     P found = P(S(-1)), lowest = zero;
-    for (int k = 0; k < sites; ++k) {  // the first of the least, or the last that is no number
+    for (int k = 0; k < sites; ++k) {  // the first of the least; the last one if all are NaN
       const auto lower = (gone[k] >= zero) & (not_(found >= zero) | not_(cost[k] >= lowest));
       found = select(lower, P(S(k)), found), lowest = select(lower, cost[k], lowest);
     }

@@ -29,7 +29,7 @@ BT_HD void put_mean(const float (&texels)[4], uint8_t& to) {
   to = uint8_t(sum / 4);
 }
 BT_HD void put_mean(const float (&texels)[4], float& to) { to = (texels[0] + texels[1] + texels[2] + texels[3]) / 4; }
-// Averages with alpha as weight, not all 0.
+// Averages weighted by alpha, of which one is above 0.
 BT_HD void put_mean(const float (&texels)[4], const float (&alpha)[4], uint8_t& to) {
   int sum = 0, total = 0;
   for (int k = 0; k < 4; ++k) {
@@ -44,7 +44,7 @@ BT_HD void put_mean(const float (&texels)[4], const float (&alpha)[4], float& to
   to = sum / max_(total, 1e-6f);
 }
 
-constexpr int kHalvedThreads = 128;  // texels of a row, half as wide as the atlas
+constexpr int kHalvedThreads = 128;  // per block, along a row of the halved texture
 template <class T>
 __global__ void __launch_bounds__(kHalvedThreads) halve_kernel(uint64_t texture, int width, bool alpha, T* to) {
   const int x = int(blockIdx.x) * kHalvedThreads + int(threadIdx.x), y = int(blockIdx.y);
@@ -110,7 +110,7 @@ cudaTextureObject_t make_texture(TexelFormat format, int height, int width, cons
 constexpr int kProbeWidth = 32, kProbeHeight = 16, kProbeAcross = kProbeWidth / 4;
 constexpr int kProbeX = kProbeWidth / 2 - 1, kProbeY = kProbeHeight / 2 - 1;
 int probe_red(int block) { return 6 * block + 11; }  // odd, as the last bit of every colour below is 1
-// Mode 6: six zeros and a one, red, green, blue and alpha twice with 7 bits, their two last bits, and weights of 0.
+// Mode 6: six zeros and a one; both endpoints of red, green, blue and alpha, 7 bits each; both P bits 1; indices 0.
 void probe_block(int block, unsigned char* to) {
   const uint64_t red = probe_red(block) >> 1, green = 127 - red, full = 127;
   const uint64_t low =
@@ -123,7 +123,7 @@ __global__ void probe_kernel(uint64_t texture, float4* to) {
 }
 constexpr float kStep = 1.0f / 0xff;  // of 8 bits
 void probe() {                        // throws when it does not work
-  // more than is read, in case a driver takes the copy's rows for rows of blocks
+  // four times what is read, in case a driver counts the copy's rows in blocks instead of texels
   std::vector<unsigned char> blocks(4 * kProbeWidth * kProbeHeight);
   for (int i = 0; i < kProbeAcross * kProbeHeight / 4; ++i) probe_block(i, blocks.data() + 16 * i);
   struct Owned {

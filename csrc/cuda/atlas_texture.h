@@ -36,8 +36,8 @@ class AtlasTexture {
   int device_ = 0;
 };
 
-// Halves a texture: means of 2 x 2 texels [height, width, 4]. Bytes give bytes, rounded as `ops.tile_levels` does;
-// halves give floats. alpha: as there.
+// Halves a texture to [height, width, 4] means of 2 x 2 texels, as `halved` of ops/baked_scene.py: bytes are rounded,
+// with `alpha` colours are weighted by the fourth channel. Halves give floats.
 template <class T> struct HalvedTexels {
   const AtlasTexture* texture;
   int height, width;

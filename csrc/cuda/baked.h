@@ -1,9 +1,8 @@
 // Forward-only renderer of a baked scene on the device.
 //
 //   list      one thread per surfel: projection, level set, bounds; for visible ones also the view colour and the tile
-//             of the atlas. Writes a row of 24 floats, all that later stages read. Pairs of surfel and tile are
-//             numbered within their tile as they are found, and written to the tile's slot of this number, or without a
-//             slot to a list shared by all tiles.
+//             of the atlas. Writes a row of 24 floats, all that later stages read. A pair of surfel and tile takes
+//             the next slot of its tile; when the tile's slots are full, it goes to a list shared by all tiles.
 //   draw      a block per tile of 16 x 16 pixels sorts the tile's list front to back (ties by the surfel's index);
 //             then one warp per 8 x 8 pixels, two per thread. A pair has the mask of the 8 x 4 parts of the tile that
 //             its surfel reaches, so a warp reads only its own pairs.
@@ -81,8 +80,8 @@ enum BakedStage { kList = 1, kDraw = 2 };
 constexpr int64_t kMostRows = int64_t(1) << 24;  // surfels times views: a pair has 24 bits of row and 8 of mask
 constexpr int64_t kMostPairs = (int64_t(1) << 31) - 1024;
 
-// Returns the bytes of working memory. After a frame its first 16 hold the number of pairs and of those without a slot,
-// which must be at most `capacity` (int64).
+// Returns the bytes of working memory. After a frame it begins with two int64: the number of pairs, and the number of
+// those without a slot. If the latter exceeds `capacity`, the frame is incomplete.
 size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t capacity, bool normals);
 
 // A frame of all views. stages: a sum of BakedStage; each needs the results of earlier ones in `memory`.

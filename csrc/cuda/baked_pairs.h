@@ -1,8 +1,8 @@
 // Pairs of surfel and screen tile of the baked renderer: how they are found and stored.
 //
-// There is no sort over all surfels or pairs, and tiles are found once. A pair takes its number within its tile from
-// the tile's counter and goes to the tile's slot of this number, or without a slot to one list of all tiles. Each
-// tile's list is sorted when the tile is drawn (baked_sort.h), so the image does not depend on the order of insertion.
+// There is no sort over all surfels or pairs, and tiles are found once. A pair takes the next slot of its tile,
+// by the tile's counter; when the slots are full, it goes to one list of all tiles. Each tile's list is sorted when the
+// tile is drawn (baked_sort.h), so the image does not depend on the order of insertion.
 #pragma once
 
 #include "cuda/baked_stages.h"
@@ -28,7 +28,7 @@ __device__ int block_sum_before(int value, int* sums, int& total) {
   __syncthreads();
   return before;
 }
-// Finds the last of `count` > 0 ascending numbers, the first of which is 0, that is at most i.
+// Returns the index of the last number that is at most i, of `count` > 0 ascending ones from 0 on.
 __device__ int last_at_most(const int* numbers, int count, int i) {
   int low = 0;
   for (int high = count; high - low > 1;) {
@@ -51,7 +51,7 @@ __device__ int most_tiles(const Footprint<float>& of, const BakedFrame& f) {
   return (of.bottom - of.top + 1) * max_(right - left + 1, 1);
 }
 
-// Returns the first tile of row `ty` in the view of row `r` of the surfels.
+// Returns the first tile of the row of tiles `ty`, in the view of the surfel with row `r`.
 __device__ uint32_t first_tile(const BakedFrame& f, uint32_t r, int ty) {
   return r / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y) + uint32_t(ty * f.tiles_x);
 }

@@ -136,8 +136,8 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
 }
 
 // Evaluates and blends a row at the thread's pixels, the first at offset (dx, dy) from the projected centre, both at
-// once for instruction-level parallelism. Without kAll there is no visible low pass and no part of the disc before the
-// near plane; PixelKernel is only for rows that it filters.
+// once for instruction-level parallelism. Without kAll, neither the low pass nor the near plane is tested: for rows
+// that need no test. PixelKernel is only for rows that it filters.
 template <bool kMaps, bool kLevels, bool kAlpha, class Kernel, bool kAll>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
   Planes<FastFloat> at[kPixels];

@@ -98,7 +98,7 @@ template <class Get, class Put> __device__ void sort_run(int n, Key* shared, Get
 
 __device__ Key key_of(const BakedMemory& m, uint32_t pair) { return Key(m.depth[pair >> 8]) << 32 | pair; }
 
-// A tile's pairs, in its slots and after those of all tiles.
+// A tile's pairs: the first in its slots, the others collected behind the slots of all tiles, at rest[slot_count].
 struct PairsOfTile {
   uint32_t *slots, *rest;
   int slot_count;

@@ -15,7 +15,7 @@ enum RowColumn {
   kRed = kLevelRow,        // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: neither residual nor alpha; -1: constants
   kLevel,                  // of the tile; the next column is unused
-  kTileX = kLevel + 2,  // centre of the tile's first texel, two; or four: colour with the constant residual, and alpha
+  kTileX = kLevel + 2,  // centre of the tile's first texel, two; for constants the shaded colour and alpha, four
   kSpanX = kTileX + 2,  // texels of the tile minus one, two
   kRow = kSpanX + 2
 };
@@ -29,7 +29,7 @@ constexpr int kChains = 4;
 struct alignas(16) TileList {
   int32_t count;             // pairs
   int32_t listed;            // pairs collected, if more than slots; 0 before
-  uint32_t rest;             // offset in `pairs` of the collected list, without its slots
+  uint32_t rest;             // offset in `pairs` of the collected pairs, minus `slots`: pair i is at rest + i
   uint32_t long_index;       // index in long_tiles plus one, 0: not long
   uint32_t chains[kChains];  // index of the last pair in `spilled` plus one, 0: none
 };

@@ -34,7 +34,7 @@ template <class S> struct CountSpace {
   }
 };
 
-// Returns the bits that distinguish the tiles and the number after the last.
+// Returns the bits of a tile's index; one past the last tile marks slots without a tile.
 int tile_bits(int64_t tiles) {
   int bits = 1;
   while ((int64_t(1) << bits) <= tiles) ++bits;

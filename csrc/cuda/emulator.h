@@ -38,7 +38,8 @@ int64_t launches();        // counts them
 int stale_numbers();            // counts threads that read what an earlier block left in shared memory
 void open_barrier();            // threads wait for one that never comes
 float read_float4(int offset);  // reads the second of four floats, `offset` floats after a multiple of 16 bytes
-void* dynamic_shared();
+
+void* dynamic_shared();  // of the running block
 
 void block_barrier();
 // Posts a value to the calling warp and returns those of all 32 lanes (0 for lanes outside the mask).

@@ -35,8 +35,8 @@ __device__ double scale_for(double most, int64_t count) {
   return ldexp(1.0, exponent < -900 ? 961 : 61 - exponent);
 }
 
-// Bounds the entries' gradients by the largest gradient of the field's output and the weights; without levels the
-// entries get shares of the gradients.
+// Bounds the gradients of the table's entries by the largest gradient of the field's output, times the weights of the
+// decoder; without levels, the largest gradient itself is the bound.
 template <class S> __global__ void range_kernel(FieldArrays<S> f, int64_t count, ExactRange* range) {
   double most;
   memcpy(&most, &range->gradient, sizeof most);

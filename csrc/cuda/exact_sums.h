@@ -19,7 +19,7 @@ struct ExactSums {
   unsigned long long* sums = nullptr;
   ExactRange* range = nullptr;
 };
-// Adds to exact sums, or to the numbers of `sums`.
+// Returns what adds to the exact sums, or to the numbers of `sums`.
 template <bool kExact, class S> __device__ Adder<S, kExact> adder(S* sums, const ExactSums& exact) {
   if constexpr (kExact)
     return {exact.sums, exact.range->scale};
@@ -27,9 +27,9 @@ template <bool kExact, class S> __device__ Adder<S, kExact> adder(S* sums, const
     return {sums};
 }
 
-// Clears the exact sums and chooses their unit so that no sum of `count` gradients overflows, each bounded by the
-// largest of `numbers`. The entries are those of the field's table; without a field, sums of shares of the gradients,
-// at most 1 in total.
+// Clears the exact sums and chooses their unit so that no sum of `count` terms overflows. The largest of `gradients`
+// [numbers] bounds a term: with a field, whose output they are for and whose table has the entries, through the
+// decoder's weights; without, a term is a gradient times a weight of at most 1.
 template <class S>
 ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* field, int64_t count, int64_t numbers,
                       const S* gradients, Stream stream);

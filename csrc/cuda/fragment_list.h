@@ -167,8 +167,8 @@ template <int kHeld> class Stretch {
   int pairs, count;  // pairs from `first` on, and their fragments
   int64_t base;      // index of the first fragment
 
-  // By all threads of the block. A barrier, `find_own` and another barrier must come before the next chunk, whose warps
-  // write to `bits` immediately.
+  // Called by all threads of the block. A barrier, `find_own` and another barrier must come before the next chunk, whose
+  // warps write to `bits` immediately.
   __device__ Stretch(const Pairs& p, const TileThread& s, int64_t first, int64_t end, int (&bits)[kTileWarps][kWarp])
       : base(p.offsets[first]), bits_(bits) {
     const int64_t own = first + s.lane;  // one lane per pair
@@ -223,7 +223,8 @@ class RowOf {
   float inverse_;
 };
 
-// Pairs of a tile's block. Those behind all tiles' have no fragments, only slots, and go to the last block.
+// Pairs of a tile's block. Pairs after those of all tiles (see BinFill) have slots and no fragments; the last block
+// takes them.
 struct PairRange {
   int64_t first, end;
 };
@@ -249,7 +250,7 @@ class TilePart {
         to[j] = image[(int64_t(top_ + row) * width_ + left_) * kChannels + column];
     }
   }
-  // Returns the index of an image's pixel in it.
+  // Returns a pixel's index in the part, from its index in the image.
   __device__ int at(int32_t pixel) const {
     const int row = row_of_(pixel);
     return (row - top_) * kTile + (pixel - row * width_ - left_);

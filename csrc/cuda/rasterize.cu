@@ -4,10 +4,11 @@
 // pair, and each pixel's transmittance. Backward, a block goes back through its tile's pairs, as many at a time as
 // their fragments fit into shared memory, in four steps:
 //   - a pass with one lane per pixel recomputes the fragments and lists them;
-//   - kRunLanes lanes per turn, most of them busy, shade them, for the gradients of weights and coordinates;
+//   - turns, kRunLanes lanes for as many fragments of a pair, shade them with most lanes busy, for the gradients of
+//     weights and coordinates;
 //   - a pass turns gradients of weights into those of sigma, with the sum over fragments behind in a register;
 //   - turns again add up the gradients of surfels, colours and texels.
-// A pair with many fragments takes many turns, shared among runs of lanes; their sums are added in order.
+// A pair with many fragments takes many turns, on different lanes; their sums are added in order.
 #include "cuda/kernels.h"
 #include "cuda/mark.h"
 #include "cuda/texel_sums.h"
@@ -79,7 +80,7 @@ template <int kHeld> struct LastPairs {
 // A fragment's pixel in the tile, and flags: colour channels above 0, multiplied by alpha, textured.
 enum FragmentBits { kPixel = kTileThreads - 1, kOpenRed = kTileThreads, kCut = 8 * kOpenRed, kTextured = 2 * kCut };
 
-// The fragments of LastPairs, and turns of kRunLanes of a pair each.
+// The fragments of LastPairs, and their turns, each of up to kRunLanes fragments of one pair.
 template <class S> struct Held : SurfelRows<S> {
   static constexpr int kFragments = sizeof(S) == 8 ? 320 : 1024, kTurns = kFragments / kRunLanes + kWarp;
   static constexpr int kColors = 4;  // sums of a pair for the view colour, the last unused
@@ -262,7 +263,7 @@ template <class S> struct StoreColorGradient {
   }
 };
 
-// Steps on the texel's colour, and writes the gradient of its alpha.
+// Takes the gradient step on a texel's colour, and writes the gradient of its alpha.
 template <class S> struct PutTexel {
   MoveTexel<S, false> color;
   S* dalpha;

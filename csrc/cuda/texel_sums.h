@@ -58,7 +58,7 @@ template <class S> struct ClearTexel {
   S* sums;
   __device__ void operator()(int64_t t) const { reinterpret_cast<Row*>(sums)[t] = {}; }
 };
-// Steps on a texel by its sums.
+// Takes the gradient step on a texel, from its sums.
 template <class S, bool kExact> struct MoveTexel {
   S* sums;
   ExactSums exact;

@@ -104,7 +104,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
   }
 }
 
-// Counts by the masks a surfel's fragments on masked pixels, without reading the list.
+// Counts each surfel's fragments on the pixels of `mask` by the pairs' bit masks, without reading the list.
 __global__ void __launch_bounds__(kTileThreads) counts_kernel(Pairs p, const uint8_t* mask, int32_t* counts) {
   const TileThread s = tile_thread(p.width);
   const bool on = s.x < p.width && s.y < p.height && mask[int64_t(s.y) * p.width + s.x];

@@ -41,7 +41,7 @@ template <class S> struct Picture {
 };
 template <class S> int64_t picture_workspace(int height, int width);
 
-// Writes photometric = (1 - share) l1 + share (1 - similarity) and falloff = weight right; [1] each.
+// Writes photometric = (1 - share) l1 + share (1 - SSIM) and falloff = weight times `right` above; [1] each.
 template <class S> struct PictureLoss {
   Picture<S> picture;
   S *photometric, *falloff;
@@ -107,7 +107,7 @@ template <class S> struct AdamRow {
     r.numbers("rate", rate, "beta1", beta1, "beta2", beta2, "eps", eps);
   }
 };
-// Steps Adam on all rows of all parameters in one launch per kAdamRows of them.
+// Takes an Adam step on `count` parameters, kAdamRows of them per launch.
 constexpr int kAdamRows = 16;
 template <class S> void adam(const AdamRow<S>* rows, int count, Stream stream);
 

@@ -69,9 +69,9 @@ template <class S> struct DrawView {
 // Draws the view and computes the losses.
 template <class S> void draw_view(const DrawView<S>& a, Stream stream);
 
-// Writes the gradients of both losses with respect to the surfels: dmeans by their projection, dmeans_color by their
-// view colours, dcolors; dgeom [n, kGeom] and absgrad [n, 2]; dcorrection and dtexel_alpha unless null. Texels move as
-// of RasterizeBackward.
+// Writes the gradients of both losses with respect to the surfels: `out` through the projection, dmeans_color [n, 3]
+// through the direction of the view colours, and dcolors; dgeom [n, kGeom] and absgrad [n, 2]; dcorrection and
+// dtexel_alpha unless null. Texels move as in RasterizeBackward.
 template <class S> struct DifferentiateView {
   DrawView<S> drawn;
   const S *dphotometric, *dfalloff, *share;

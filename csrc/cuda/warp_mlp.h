@@ -5,8 +5,8 @@
 //   of the first factor the numbers (g, t), (g + 8, t), (g, t + 4), (g + 8, t + 4),
 //   of the second factor (t, g), (t + 4, g),
 //   of the product (g, 2t), (g, 2t + 1), (g + 8, 2t), (g + 8, 2t + 1).
-// The inner index that is at t and at t + 4 is free if both factors agree. With 2t and 2t + 1 a lane's numbers of a
-// product are its numbers of the next layer's first factor, so layers chain in registers.
+// The inner indices held at t and t + 4 may be any two, if both factors agree. With 2t and 2t + 1, a lane's numbers of
+// a product are its numbers of the next layer's first factor, so layers chain in registers.
 #pragma once
 
 #include <type_traits>

@@ -45,8 +45,8 @@ constexpr int blend_sums(bool maps) { return maps ? 8 : 4; }
 
 // Writes ddepth [F] (maps only), dgeom [n, kGeom] (beta and normal columns), dbase [n, 3] and, unless null, dweight
 // [F], duv [2, F] and dresidual [F, 3]. Texel t of `moved` [texels, 3], which may be the texels that are read, moves by
-// -rate share[t] times its gradient; number t of `squares` [texels], unless null, likewise by the gradient of the first
-// channel, whose fragments count once more by their weight (on CUDA: the CPU has texel_coverage). partial [pairs,
+// -rate share[t] times its gradient. squares [texels], unless null, moves likewise by the gradient of the first channel
+// with each fragment multiplied by its weight once more (CUDA only: the CPU has texel_coverage). partial [pairs,
 // blend_sums] and work are working memory.
 template <class S, class Layout> struct BlendBackward {
   BlendedSurfels<S, Layout> of;

@@ -75,7 +75,7 @@ template <class S> struct TexelWork {
 // Channels of a baked image on the CPU: rgb, alpha; with maps those of BlendForward.
 constexpr int kBakedChannels = 4;
 
-// Texels of n surfels.
+// Residual and alpha of n baked surfels.
 struct BakedResidual {
   float offset, scale;         // residual = offset + scale * stored
   const float* extent;         // [n] half side of the tile, scale units; null: kSupport everywhere

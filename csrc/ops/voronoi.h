@@ -6,9 +6,9 @@
 
 namespace bt {
 
-// For n surfels: minimise sum over directions of weight |c(d) - target(d)|^2 over the vectors and the colours of their
-// sites, by Levenberg-Marquardt. c is the mean of the sites' colours, weighted with softmax(vector . d); the first site
-// has the vector 0.
+// Minimises, for each of n surfels, the sum over directions of weight |c(d) - target(d)|^2 over the vectors and colours
+// of its sites, by Levenberg-Marquardt. c is the mean of the sites' colours, weighted by softmax(vector . d); the first
+// site has the vector 0.
 template <class S> struct FitSites {
   int64_t n;
   int sites, directions, rounds;
@@ -24,9 +24,9 @@ template <class S> struct FitSites {
   }
 };
 
-// For n surfels: rank the sites of a colour by how much they are needed. While more than one is left, that site goes
-// without which the colour changes least: by w / (1 - w) (c - color), w its weight; weighted squares are summed over
-// the directions.
+// Ranks the sites of each of n surfels by how much the colour needs them. While more than one is left, removes the site
+// whose removal changes c least: by w / (1 - w) (c - color) for a site of weight w, squared and summed over the
+// directions by their weights.
 template <class S> struct RankSites {
   int64_t n;
   int sites, directions;

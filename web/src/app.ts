@@ -189,7 +189,7 @@ export class App implements Stage {
     };
   }
 
-  // Correction at the camera of a photograph: a path, which may pass one, has the mean exposure.
+  // Colour correction of the photograph whose pose the camera has; none on a path, which may pass through such poses.
   private get correction(): number[] | null {
     const shows = this.show === 'color' && pressed(element('exposure')) && !this.path.plays;
     return shows ? correctionAt(this.cameras, this.controls.pose) : null;

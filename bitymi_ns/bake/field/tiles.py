@@ -37,10 +37,10 @@ class Field(Protocol):
     """
 
     def __call__(self, x: Tensor) -> Tensor:
-        """[M, 3] world positions to [M, 3] residual colours."""
+        """Map world positions [M, 3] to residual colours [M, 3]."""
 
     def voxel_size(self, x: Tensor) -> Tensor:
-        """[M, 3] world positions to [M, 2] finest voxel edges (radial, tangential), world units."""
+        """Map world positions [M, 3] to finest voxel edges [M, 2] (radial, tangential), world units."""
 
 
 @torch.no_grad()
@@ -52,7 +52,7 @@ def field_tiles(
     progress: Progress = no_progress,
 ) -> BakeState:
     """Give the surfels of a bake tiles with the values of a field at the texel centres; surfels that no view blends are
-    left out. `prune.prune_and_resample` then drops what the options say, as of trained texels.
+    left out. `prune.prune_and_resample` then drops what the options say, as for trained texels.
 
     With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it nothing is seen: the
     field is read at the nearest point of the disc, so values stay smooth and within the range of what is seen.
@@ -95,8 +95,8 @@ def field_tiles(
 def grids(
     inputs: BakeInput, field: Field, options: BakeOptions, pixels_per_texel: float | None
 ) -> tuple[Tensor, Tensor, KeptTexels]:
-    """Choose the finest grids of use: sides [N, 2] int32, (0, 0) = none, and half sides [N]; also counts the texels by
-    each rule."""
+    """Choose the finest useful grids: sides [N, 2] int32, (0, 0) = none, and half sides [N] in scale units; also count
+    the texels by each rule."""
     surfels = inputs.surfels
     means, scales, axes = surfels["means"], surfels["log_scales"].exp(), tangents(surfels["quats"])
     opacity, beta = kernel_parameters(surfels, inputs.transmittance)

@@ -1,8 +1,8 @@
-"""Runs of several processes, which torchrun starts: nerfstudio's own start needs CUDA and torch's
-DistributedDataParallel, which knows no parameters that change their size.
+"""Multi-process runs, started by torchrun: nerfstudio's launcher needs CUDA and torch's DistributedDataParallel, which
+cannot handle parameters that change their size.
 
 The first process checks, prints, evaluates and saves as it would alone. The others wait until it is about to train,
-take its configuration, and write into folders of their own that are thrown away."""
+take its configuration, and write into temporary folders."""
 
 from __future__ import annotations
 
@@ -29,18 +29,19 @@ if TYPE_CHECKING:
 TIMEOUT = timedelta(minutes=30)  # timeout for a process that does not answer; one that has ended is noticed at once
 SETUP = timedelta(days=7)  # timeout for the first process to read the capture and to find its poses
 LOST = 3  # exit status of a process that ends because another one has
-CONFIG = "config"  # name of a file, and of what the first process tells the others
+CONFIG = "config"  # file of the pickled configuration, and its key in torch.distributed's store
 
 
 def own(group: str = "") -> Processes:
-    """Return this process among those of the run, those on this machine (LOCAL_), or its machine among all (GROUP_)."""
+    """Return this process's rank in the run and the number of processes; LOCAL_: the same on this machine; GROUP_: the
+    rank of this machine and the number of machines."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return ALONE
     return Processes(int(os.environ[f"{group}RANK"]), int(os.environ[f"{group}WORLD_SIZE"]))
 
 
 def run(config: TrainerConfig) -> NoReturn:
-    """Have torchrun start the processes of a run, and end as they do.
+    """Start the processes of a run with torchrun, wait for them, and exit with their status.
 
     Raises:
         SystemExit: always; with a message where no process has printed one.
@@ -57,10 +58,10 @@ def run(config: TrainerConfig) -> NoReturn:
             f"--node-rank K --rdzv-endpoint HOST:PORT --nproc-per-node {count} --no-python ns-train ..."
         )
     os.environ["OMP_NUM_THREADS"] = str(max(1, torch.get_num_threads() // count))
-    os.environ["PYTHONWARNINGS"] = "ignore"  # those of nerfstudio's import were shown once
-    # the step that Ctrl-C ends after, and its checkpoint, may take longer than torchrun's 30 s
+    os.environ["PYTHONWARNINGS"] = "ignore"  # this process has shown those of nerfstudio's import
+    # after Ctrl-C, the current step and its checkpoint may take longer than torchrun's 30 s
     os.environ.setdefault("TORCH_ELASTIC_SHUTDOWN_TIMEOUT", str(round(TIMEOUT.total_seconds())))
-    logging.disable()  # torchrun's; the processes speak for themselves
+    logging.disable()  # torchrun's log: the processes print their own messages
     with tempfile.TemporaryDirectory() as scratch:
         Path(scratch, CONFIG).write_bytes(pickle.dumps(config))
         words = ["--standalone", "--local-addr", "127.0.0.1", "--nproc-per-node", str(count), "--log-dir", scratch]
@@ -75,11 +76,11 @@ def run(config: TrainerConfig) -> NoReturn:
 
 
 def end(statuses: dict[int, int], count: int) -> NoReturn:
-    """End as the process that ended first, with a message unless it has printed one itself.
+    """Exit with the status of the process that failed first, and print a message unless it has printed one.
 
     Args:
-        statuses: exit statuses of processes by rank, in the order in which they were noticed; negative: of a signal.
-        count: of all processes.
+        statuses: rank -> exit status, in the order in which torchrun noticed them; negative: killed by that signal.
+        count: number of processes of the run.
     """
     rank, status = next(((r, s) for r, s in statuses.items() if s != LOST), (0, LOST))
     if status == LOST:
@@ -91,7 +92,7 @@ def end(statuses: dict[int, int], count: int) -> NoReturn:
 
 
 def work() -> None:
-    """Run a process that `run` had torchrun start, with the configuration in the folder that the command names."""
+    """Train in a process started by `run`, with the configuration in the folder named on the command line."""
     from nerfstudio.scripts.train import train_loop
 
     tempfile.tempdir = sys.argv[1]  # `run` removes it, whatever ends this process
@@ -107,11 +108,11 @@ def work() -> None:
 
 
 def join(config: TrainerConfig) -> None:
-    """Enter torch.distributed's default group: gloo for what decides, and nccl for what lies on cards. The first
-    process gives its configuration to the others.
+    """Join torch.distributed's default group: gloo for CPU tensors, nccl for CUDA tensors. The other processes take the
+    configuration of the first.
 
     Raises:
-        InputError: another process has ended before.
+        InputError: another process has ended.
     """
     try:
         with raise_process_lost():
@@ -119,10 +120,10 @@ def join(config: TrainerConfig) -> None:
             if rank == 0:
                 store.set(CONFIG, pickle.dumps(config))
             else:
-                for number in (signal.SIGINT, signal.SIGTERM):  # handlers of Python wait for torch, COLMAP's prints
+                for number in (signal.SIGINT, signal.SIGTERM):  # Python's handlers wait for torch, COLMAP's print
                     signal.signal(number, signal.SIG_DFL)
                 vars(config).update(vars(pickle.loads(store.get(CONFIG))))
-                signal.signal(signal.SIGINT, signal.SIG_IGN)  # before and after training the first process decides
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # outside training, the first process handles it
                 vars(config)["scratch"] = scratch = tempfile.TemporaryDirectory()  # kept until the process ends
                 config.output_dir, config.vis = Path(scratch.name), "none"
                 config.pipeline.model.curve_points = 0

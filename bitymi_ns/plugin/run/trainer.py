@@ -35,17 +35,17 @@ from bitymi_ns.train.processes import ProcessesApart, ProcessLost
 if TYPE_CHECKING:
     from torch.cuda.amp.grad_scaler import GradScaler
 
-AGAIN = 1.0  # seconds; signals within are one: a batch system's comes from it and from torchrun
+AGAIN = 1.0  # seconds within which signals count as one: a batch system's arrives directly and through torchrun
 
 
 class _StopAfterStep(Exception):
-    """Ends training after a step."""
+    """Request to end training after a step."""
 
 
 class TogetherOptimizers(Optimizers):
-    """nerfstudio's optimisers, one per parameter group, stepping together in less time."""
+    """nerfstudio's optimisers, one per parameter group, stepped together, which is faster."""
 
-    # called before each step with all gradients; returns the factors of `optimizers.step`
+    # called before each step, once the gradients are computed; returns the factors of `optimizers.step`
     before_step: Callable[[], Mapping[str, Tensor]] | None = None
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
@@ -61,17 +61,17 @@ class TogetherOptimizers(Optimizers):
 
 
 class BitymiTrainer(Trainer):
-    """Trains to a total number of steps, so that interrupted and resumed runs end like uninterrupted ones; each process
-    of a run has one, in step."""
+    """Trainer to a total number of steps, so that interrupted and resumed runs end like uninterrupted ones. Every
+    process of a run has one; they train in step."""
 
     def __init__(self, config: TrainerConfig, **alone: Any) -> None:
-        here = torchrun.own("LOCAL_")  # nerfstudio, which has not started the process, takes it for the only one
+        here = torchrun.own("LOCAL_")  # nerfstudio did not start the process and passes rank 0 of 1
         with filter_console():
             super().__init__(config, here.rank, here.count)
         self.processes = torchrun.own()
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        self._stop_requested = 0.0  # when; 0 = it was not
+        self._stop_requested = 0.0  # time.monotonic() of the first signal; 0 = none
         try:
             with filter_console():
                 super().setup(test_mode)
@@ -103,7 +103,7 @@ class BitymiTrainer(Trainer):
             else:
                 path = Path(config.load_checkpoint)
             if self.processes.first:
-                files.remove_unfinished(path.parent.parent)  # of the run that was killed
+                files.remove_unfinished(path.parent.parent)  # left by a killed run
             self._restore(checkpoints.load(path, config.pipeline.model.scene), path)
             say(f"Resuming after step {self._start_step - 1} from {path}")
         config.resolve_length(getattr(self.pipeline.model, "trained_for", None))
@@ -131,7 +131,7 @@ class BitymiTrainer(Trainer):
         except ProcessesApart as error:
             fail(f"training cannot go on at step {self.step}: {error}.", error)
         finally:
-            # a card may wait for a process that is lost: then the end of this one is the remedy
+            # a card that waits for a lost process would block this: it is freed when this process ends
             if dist.is_initialized() and (orderly or self.config.machine.device_type != "cuda"):
                 dist.destroy_process_group()
             run_folder.leave(self.base_dir)
@@ -214,7 +214,7 @@ class BitymiPipeline(VanillaPipeline):
     """nerfstudio's pair of data manager and model."""
 
     def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
-        # one process: nerfstudio would wrap the model, to add gradients of parameters that keep their size
+        # without `world_size`, for which nerfstudio would wrap the model in DistributedDataParallel (`torchrun`)
         super().__init__(*args, **kwargs)
         self.datamanager.world_size = world_size
 
@@ -224,7 +224,7 @@ class BitymiPipeline(VanillaPipeline):
             super().load_pipeline(loaded_state, step)
         except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
-        if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # a run has its own
+        if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # in training the callbacks do this
             return
         state, held_out = self.model.resume_state, to_cameras(self.datamanager.eval_dataset.cameras, "cpu")
         if (poses := state.get("poses")) is not None and poses["motions"] is not None:
@@ -234,8 +234,8 @@ class BitymiPipeline(VanillaPipeline):
             self.model.corrections = list(zip(held_out, found, strict=True))
 
     def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Average over images, without NaN, which JSON does not know, and metrics that images without counting pixels
-        lack; the deviation of a single image is 0."""
+        """Average the metrics over the images, leaving out those that are NaN (JSON has no NaN) because no pixel of an
+        image counts; the deviation of a single image is 0."""
         if len(data_loader) == 0:
             fail("there is no held-out view to evaluate: none was held out, or their masks exclude every pixel")
         metrics = super().get_average_image_metrics(data_loader, *args, **kwargs)

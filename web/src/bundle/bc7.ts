@@ -8,7 +8,7 @@ interface Mode {
   selector: number;
   color: number;
   alpha: number;
-  shared: 'none' | 'endpoint' | 'subset'; // scope of the separate lowest bit
+  shared: 'none' | 'endpoint' | 'subset'; // P bits: none, one per endpoint or one per subset
   index: number;
   index2: number;
 }

@@ -51,7 +51,7 @@ export const alphaWord = (m: number): number => (Math.min(Math.round(128 * m), 2
 export const layerIn = (word: number): number => word & 0xffffff;
 export const alphaIn = (word: number): number => (word >>> 24) / 128;
 
-// Returns the scene's centre, the origin of float32 positions, which lack precision far from the world's.
+// Returns the scene's centre, as the origin of positions: in float32 they lack precision far from the world's origin.
 export const originOf = ({ bounds }: Manifest): Vec3 => bounds.min.map((low, c) => (low + bounds.max[c]) / 2) as Vec3;
 
 // Subtracts the origin from the means.

@@ -88,7 +88,7 @@ export class Renderer {
     return this.target;
   }
 
-  // Samples a view at rest several times per pixel, a far one only where surfels can be seen.
+  // Chooses the samples per pixel, more than one only at rest, and of a far view the part where surfels can be seen.
   private samplingOf(view: View, options: DrawOptions): [Sampling, Part] {
     const whole: Part = [0, 0, view.width, view.height];
     const { info, surfels } = this.scene;

@@ -8,7 +8,7 @@ export function element<T extends HTMLElement = HTMLElement>(id: string): T {
 export const press = (button: HTMLElement, on: boolean): void => button.setAttribute('aria-pressed', String(on));
 export const pressed = (button: HTMLElement): boolean => button.getAttribute('aria-pressed') === 'true';
 
-// Creates an element with properties, attributes of the same name, and children.
+// Creates an element with properties and children.
 export function make<K extends keyof HTMLElementTagNameMap>(
   tag: K,
   properties: Partial<HTMLElementTagNameMap[K]>,
@@ -21,7 +21,7 @@ export function make<K extends keyof HTMLElementTagNameMap>(
 
 export const onClick = (id: string, run: () => void): void => element(id).addEventListener('click', run);
 
-// Creates a button, with a name for screen readers if its text is none.
+// Creates a button. ariaLabel: name for screen readers, if the text is a symbol.
 export const button = (
   text: string,
   { run, ...properties }: { title: string; run: () => void; className?: string; ariaLabel?: string },

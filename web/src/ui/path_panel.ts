@@ -12,7 +12,7 @@ interface Playing {
   record: boolean;
   film: Film | null; // from the first drawn view on
   since: number; // time, ms, of the first view
-  wanted: View | null; // the first and last view, until drawn
+  wanted: View | null; // the first or the last view, until it is drawn
 }
 
 export class PathPanel {

@@ -19,7 +19,7 @@ export class Picker {
     canvas.addEventListener('pointerdown', ({ isPrimary, button, clientX, clientY }) => {
       this.pressedAt = isPrimary && button === 0 ? [clientX, clientY] : null;
     });
-    // not `click`, which a finger that rests for long does not give
+    // not `click`, which a long touch does not fire
     canvas.addEventListener('pointerup', ({ clientX, clientY, pointerType }) => {
       const { wanted, pressedAt } = this;
       this.pressedAt = null;
@@ -56,7 +56,7 @@ export class Picker {
     this.canvas.classList.remove('placing');
   }
 
-  // Starts with the button released, stops otherwise.
+  // Starts if the button is not pressed, else stops.
   toggle(button: string, run: (point: Vec3) => void): void {
     if (pressed(element(button))) this.stop();
     else this.start(button, run);

@@ -5,7 +5,8 @@ import type { Shared, Viewpoint } from '../view/share';
 
 export interface Stage {
   shared(): Shared;
-  go(to: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void; // by default the target is one unit ahead
+  // The target is by default ahead, at the distance of the cameras' common target, or else at the size of the scene.
+  go(to: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void;
   fly(to: Viewpoint): void; // animated, until the user moves the camera
   pixels(): [number, number]; // of the canvas
   view(): View; // on the canvas

@@ -62,7 +62,7 @@ export class CameraPath {
     return new View(poseOf(along(place), rotation), fx, fy, cx, cy, width, height);
   }
 
-  // Computes the rates of change of `step` between keyframes at the ends of a segment, per second.
+  // Computes the speeds, per second, at the ends of a segment. step: difference of a value between two keyframes.
   private speeds(segment: number, step: (a: Keyframe, b: Keyframe) => Vec3): [Vec3, Vec3] {
     const count = this.keyframes.length;
     const speed = (k: number): Vec3 | null => {

@@ -22,7 +22,7 @@ export function extentOf(surfels: Surfels): { middle: Vec3; size: number } {
 }
 
 // Chooses the first pose. The scene frame's origin is the mean of the cameras, the farthest of which is about 1
-// away. So a scene on one side is viewed from the origin's side, and a scene around the origin from aside.
+// away. So a scene on one side is viewed from the origin's side, and a scene around the origin from the side.
 export function firstPose(middle: Vec3, size: number, up: Vec3): Pose {
   const distance = Math.min(Math.max(1, 0.5 * size), 1.6 * size);
   const across = unit(cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));

@@ -6,7 +6,7 @@ import { decodeIntegers } from './integers';
 export interface Column {
   name: string;
   step: number | null;
-  bytes: number[] | null; // of each number; null before version 5, which has these:
+  bytes: number[] | null; // of each number; null before version 5, whose columns have instead:
   low: number[];
   planes: number[][]; // sizes of Zstandard frames per number, lowest byte first
 }
@@ -45,7 +45,7 @@ export class ColumnReader {
     return this.columns[this.next]?.name;
   }
 
-  // Reads the next column: an array of `rows` codes per number. blocks: of which they are coefficients, 0 = of none.
+  // Reads the next column: an array of `rows` codes per number. blocks: as in decodeIntegers.
   read<T extends Codes>(rows: number, make: (rows: number) => T, blocks = 0): T[] {
     const { bytes, low, planes } = this.columns[this.next++];
     const sums = blocks && bytes && bytes.length > 1 ? new Uint8Array(rows) : null;
@@ -62,7 +62,7 @@ export class ColumnReader {
     });
   }
 
-  // Decodes a number, as decodeIntegers.
+  // Decodes one number of all rows by decodeIntegers.
   private decode<T extends Codes>(size: number, codes: T, blocks: number, sums: Uint8Array | null, number: number): T {
     try {
       decodeIntegers(this.data.subarray(this.at, this.at + size), codes, blocks, sums, number);

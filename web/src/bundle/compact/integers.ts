@@ -9,11 +9,11 @@ const MOST_THRESHOLDS = 7;
 const ORDERS = 3; // kinds of contexts
 const LEVEL_BOUNDS = [3, 7, 13, 21, 32, 56, 96]; // of 16 times the running mean of magnitudes
 const MOST_MAGNITUDE = 255; // in a running mean
-// Context of a running mean.
+// Context by 16 times a running mean.
 const LEVELS = Uint8Array.from({ length: 16 * MOST_MAGNITUDE + 16 }, (_, mean) => {
   return 1 + LEVEL_BOUNDS.filter((bound) => mean >= bound).length;
 });
-const MOST_OTHERS = 2; // of the sums of earlier numbers
+const MOST_OTHERS = 2; // largest sum of the magnitudes of a row's earlier numbers
 
 class Bytes {
   private at = 0;
@@ -73,9 +73,9 @@ function readTables(bytes: Bytes, contexts: number, most: number): Tables {
   return { tokens, steps };
 }
 
-// Decodes a number of every row of a column into `codes`. blocks: rows are coefficients of so many blocks, 0 = they are
-// plain; sums: of the magnitudes of the rows' numbers, at most 2, to which these are added; null = not wanted; number:
-// how many came before.
+// Decodes one number of every row of a column into `codes`. blocks: number of blocks whose coefficients the rows are;
+// 0 = plain rows. sums: by row, the sum of the magnitudes of its earlier numbers, at most 2, to which these are added;
+// null = not needed. number: index of the number in a row.
 export function decodeIntegers(
   data: Uint8Array,
   codes: Float64Array | Int32Array,

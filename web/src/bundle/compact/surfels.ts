@@ -6,7 +6,7 @@ import { alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
-export const SURFELS_PER_BYTE = 1; // upper bound of a file's claim, plus SPARE_SURFELS
+export const SURFELS_PER_BYTE = 1; // most that a file may state, beyond SPARE_SURFELS
 export const SPARE_SURFELS = 1 << 12;
 const POSITION_BITS = 17;
 const SHARE = 1 / 1024; // margin of opacities and betas to the ends of their ranges
@@ -61,7 +61,7 @@ function thirds(key: number): number {
   return cell;
 }
 
-// Colours from columns green, red - green, blue - green, starting at column `at`, row i.
+// Writes a colour from row i of the columns green, red - green and blue - green, the first at `at`.
 function color(to: Float32Array, first: number, of: Float64Array[], at: number, i: number, step: number): void {
   const green = of[at][i];
   to[first] = within(step * (of[at + 1][i] + green), MOST.color);

@@ -5,7 +5,7 @@ import type { Atlas, CodedTexels } from '../manifest';
 import { SURFEL_WORDS, type Surfels, WORD, alphaIn, layerIn } from '../surfels';
 import { ColumnReader, checkColumns } from './columns';
 
-export const TEXELS_PER_BYTE = 64; // of both files: upper bound of their claim, plus SPARE_TEXELS
+export const TEXELS_PER_BYTE = 64; // of both files: most that they may state, beyond SPARE_TEXELS
 export const SPARE_TEXELS = 1 << 20;
 const MOST_TEXELS = 2 ** 30; // in all pages: four gigabytes
 const BLOCK = 8;
@@ -36,7 +36,7 @@ interface Transform {
   v: number;
   across: Float64Array; // [u, u], frequency by position
   down: Float64Array; // [v, v]
-  // by coefficient in stored order: first number of its frequency along v in a row of u, and along u in `across`
+  // by coefficient in stored order: offset of the row of its frequency along v in `half`, and along u in `across`
   row: Int32Array;
   wave: Int32Array;
 }
@@ -56,7 +56,7 @@ function transformOf(u: number, v: number): Transform {
   return { u, v, across: cosines(u), down: cosines(v), row, wave };
 }
 
-const half = new Float64Array(BLOCK * BLOCK); // of `inverse`, transformed along u
+const half = new Float64Array(BLOCK * BLOCK); // scratch of `inverse`: a block transformed along u
 
 // Computes a channel of a block's texels from every `stride`-th number from `first` on. Sides are multiples of four.
 function inverse(values: Int32Array, first: number, stride: number, of: Transform, texels: Float64Array): void {

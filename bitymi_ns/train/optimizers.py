@@ -46,7 +46,7 @@ PLAIN = {"fused": True, "weight_decay": 0.0, "amsgrad": False, "maximize": False
 """Options of the Adam groups that `step` fuses."""
 
 
-class _Row(NamedTuple):
+class _AdamParameter(NamedTuple):
     """A parameter of a fused Adam optimiser, with its state and options."""
 
     parameter: Tensor
@@ -62,7 +62,7 @@ class _Row(NamedTuple):
 
 @torch.no_grad()
 def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> None:
-    """Step all optimisers, as calling each one's `step` would, and scale the updates row by row.
+    """Step all optimisers, as calling each one's `step` would, and scale the updates row by each.
 
     Each Adam.step costs 100-200 us of Python, ten times the GPU work. Fused Adam optimisers are therefore stepped
     together: on the CPU by one call per learning rate, bit-identical to each `step`, on CUDA devices by one kernel.
@@ -71,7 +71,7 @@ def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> 
         optimizers: by parameter group.
         factors: row factors [N] of the updates of parameters [N, ...], by parameter group.
     """
-    rows: list[_Row] = []
+    fused: list[_AdamParameter] = []
     for name, optimizer in optimizers.items():
         found = _fusable(optimizer, factors.get(name))
         if found is None:
@@ -80,53 +80,55 @@ def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> 
             for parameter, values in zip(optimizer.param_groups[0]["params"], before, strict=False):
                 _scale_update(parameter, values, factors[name])
         else:
-            rows += found
-    if rows and cuda_backend(rows[0].parameter.device):
-        _step_by_kernel(rows)
-    elif rows:
-        _step_by_torch(rows)
+            fused += found
+    if fused and cuda_backend(fused[0].parameter.device):
+        _step_by_kernel(fused)
+    elif fused:
+        _step_by_torch(fused)
 
 
 def _scale_update(parameter: Tensor, before: Tensor, factors: Tensor) -> None:
     torch.lerp(before, parameter, factors.view(-1, *[1] * (parameter.ndim - 1)), out=parameter)
 
 
-def _step_by_kernel(rows: Sequence[_Row]) -> None:
-    device = rows[0].parameter.device
+def _step_by_kernel(fused: Sequence[_AdamParameter]) -> None:
+    device = fused[0].parameter.device
     arguments = [
         {
-            "parameter": row.parameter,
-            "gradient": dense(row.gradient, row.parameter),
-            "mean": row.mean,
-            "square": row.square,
-            "step": row.step,
-            "width": row.parameter[0].numel() if row.factors is not None and len(row.parameter) else 1,
-            "factors": row.factors,
-            "rate": row.rate,
-            "beta1": row.betas[0],
-            "beta2": row.betas[1],
-            "eps": row.eps,
+            "parameter": each.parameter,
+            "gradient": dense(each.gradient, each.parameter),
+            "mean": each.mean,
+            "square": each.square,
+            "step": each.step,
+            "width": each.parameter[0].numel() if each.factors is not None and len(each.parameter) else 1,
+            "factors": each.factors,
+            "rate": each.rate,
+            "beta1": each.betas[0],
+            "beta2": each.betas[1],
+            "eps": each.eps,
         }
-        for row in rows
+        for each in fused
     ]
     with on_device(device):
-        kernel_class("adam", rows[0].parameter)(arguments, stream=stream_of(device))
+        kernel_class("adam", fused[0].parameter)(arguments, stream=stream_of(device))
 
 
-def _step_by_torch(rows: Sequence[_Row]) -> None:
-    scaled = [(row.parameter, row.parameter.detach().clone(), row.factors) for row in rows if row.factors is not None]
-    batches: dict[tuple[Any, ...], list[_Row]] = {}
-    for row in rows:
-        batches.setdefault((row.parameter.dtype, row.rate, *row.betas, row.eps), []).append(row)
-    torch._foreach_add_([row.step for row in rows], 1.0)
+def _step_by_torch(fused: Sequence[_AdamParameter]) -> None:
+    scaled = [
+        (each.parameter, each.parameter.detach().clone(), each.factors) for each in fused if each.factors is not None
+    ]
+    batches: dict[tuple[Any, ...], list[_AdamParameter]] = {}
+    for each in fused:
+        batches.setdefault((each.parameter.dtype, each.rate, *each.betas, each.eps), []).append(each)
+    torch._foreach_add_([each.step for each in fused], 1.0)
     for (_, rate, first, second, eps), batch in batches.items():
         torch._fused_adam_(
-            [row.parameter for row in batch],
-            [row.gradient for row in batch],
-            [row.mean for row in batch],
-            [row.square for row in batch],
+            [each.parameter for each in batch],
+            [each.gradient for each in batch],
+            [each.mean for each in batch],
+            [each.square for each in batch],
             [],
-            [row.step for row in batch],
+            [each.step for each in batch],
             lr=rate,
             beta1=first,
             beta2=second,
@@ -139,7 +141,7 @@ def _step_by_torch(rows: Sequence[_Row]) -> None:
         _scale_update(parameter, before, row_factors)
 
 
-def _fusable(optimizer: Optimizer, factors: Tensor | None) -> list[_Row] | None:
+def _fusable(optimizer: Optimizer, factors: Tensor | None) -> list[_AdamParameter] | None:
     """List the parameters with a gradient; None if the optimiser must step itself, because it is no plain fused Adam or
     has no state yet."""
     if type(optimizer) is not Adam:
@@ -156,7 +158,9 @@ def _fusable(optimizer: Optimizer, factors: Tensor | None) -> list[_Row] | None:
             if not state or gradient.is_sparse or state["step"].device != parameter.device:
                 return None
             moments = (state["exp_avg"], state["exp_avg_sq"], state["step"])
-            found.append(_Row(parameter, gradient, *moments, group["lr"], group["betas"], group["eps"], factors))
+            found.append(
+                _AdamParameter(parameter, gradient, *moments, group["lr"], group["betas"], group["eps"], factors)
+            )
     return found
 
 

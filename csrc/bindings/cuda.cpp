@@ -43,12 +43,12 @@ template <class S> void bind_adam(nb::module_& m, const std::string& name) {
   m.def(
       name.c_str(),
       [name](const nb::list& parameters, uint64_t stream) {
-        std::vector<AdamRow<S>> rows;
+        std::vector<AdamParameter<S>> found;
         for (nb::handle each : parameters) {
           Reader r(name, nb::cast<nb::kwargs>(each), kCard);
-          rows.push_back(read<AdamRow<S>>(r));
+          found.push_back(read<AdamParameter<S>>(r));
         }
-        adam(rows.data(), int(rows.size()), reinterpret_cast<Stream>(uintptr_t(stream)));
+        adam(found.data(), int(found.size()), reinterpret_cast<Stream>(uintptr_t(stream)));
       },
       "parameters"_a, "stream"_a = 0, "Steps Adam on parameters, a dictionary of arguments for each.");
 }

@@ -1,4 +1,5 @@
 // Texels of one surfel's fragments: positions and values per block, gradients as vectors of four.
+#pragma once
 
 #include "cpu/blocks.h"
 #include "ops/texel.h"

@@ -82,7 +82,6 @@ void exclusive_sum(const int32_t* in, int64_t* out, int64_t n, void*, int64_t, S
 #define BT_INSTANTIATE(Key)                           \
   template int64_t sort_workspace<Key>(int64_t, int); \
   template void sort_pairs<Key>(const Key*, Key*, const int32_t*, int32_t*, int64_t, int, void*, int64_t, Stream);
-BT_INSTANTIATE(uint16_t)
 BT_INSTANTIATE(uint32_t)
 BT_INSTANTIATE(uint64_t)
 

@@ -25,7 +25,7 @@ template <class S> BT_HD typename SortKey<S>::type sort_key(S x) {
   return bits & top ? ~bits : bits | top;
 }
 
-// Stable sort of (key, value) pairs by the low `bits` bits of the keys. Key: uint16_t, uint32_t or uint64_t; n below
+// Stable sort of (key, value) pairs by the low `bits` bits of the keys. Key: uint32_t or uint64_t; n below
 // 2^31.
 template <class Key> int64_t sort_workspace(int64_t n, int bits);
 template <class Key>

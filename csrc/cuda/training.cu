@@ -191,18 +191,18 @@ int sum_blocks(int64_t n) { return int(min_(ceil_div(n, kThreads), int64_t(kMost
 
 // Parameters of one launch; each has the blocks from first_block on.
 constexpr int kAdamEach = 4;  // numbers per thread
-template <class S> struct AdamRows {
-  AdamRow<S> rows[kAdamRows];
-  unsigned first_block[kAdamRows];
+template <class S> struct AdamParameters {
+  AdamParameter<S> each[kAdamParameters];
+  unsigned first_block[kAdamParameters];
   int count;
 };
-template <class S> __global__ void __launch_bounds__(kThreads) count_kernel(AdamRows<S> a) {
-  if (int(threadIdx.x) < a.count) *a.rows[threadIdx.x].step += 1.0f;
+template <class S> __global__ void __launch_bounds__(kThreads) count_kernel(AdamParameters<S> a) {
+  if (int(threadIdx.x) < a.count) *a.each[threadIdx.x].step += 1.0f;
 }
-template <class S> __global__ void __launch_bounds__(kThreads) adam_kernel(AdamRows<S> a) {
+template <class S> __global__ void __launch_bounds__(kThreads) adam_kernel(AdamParameters<S> a) {
   int of = a.count - 1;
   while (blockIdx.x < a.first_block[of]) --of;
-  const AdamRow<S>& r = a.rows[of];
+  const AdamParameter<S>& r = a.each[of];
   const AdamRates<S> rates = adam_rates<S>(r.rate, r.beta1, r.beta2, r.eps, double(*r.step));
   const int64_t first = int64_t(blockIdx.x - a.first_block[of]) * (kThreads * kAdamEach) + threadIdx.x;
   BT_UNROLL
@@ -280,14 +280,14 @@ template <class S> void accumulate_statistics(const DensifyStatistics<S>& a, Str
   if (a.n) BT_LAUNCH(statistics_kernel<S>, blocks_for(a.n), dim3(kThreads), 0, stream, a);
 }
 
-template <class S> void adam(const AdamRow<S>* rows, int count, Stream stream) {
-  for (int from = 0; from < count; from += kAdamRows) {
-    AdamRows<S> a = {};
-    a.count = min_(count - from, kAdamRows);
+template <class S> void adam(const AdamParameter<S>* parameters, int count, Stream stream) {
+  for (int from = 0; from < count; from += kAdamParameters) {
+    AdamParameters<S> a = {};
+    a.count = min_(count - from, kAdamParameters);
     unsigned blocks = 0;
     for (int i = 0; i < a.count; ++i) {
-      a.rows[i] = rows[from + i], a.first_block[i] = blocks;
-      blocks += unsigned(ceil_div(a.rows[i].count, kThreads * kAdamEach));
+      a.each[i] = parameters[from + i], a.first_block[i] = blocks;
+      blocks += unsigned(ceil_div(a.each[i].count, kThreads * kAdamEach));
     }
     BT_LAUNCH(count_kernel<S>, dim3(1), dim3(kThreads), 0, stream, a);
     if (blocks) BT_LAUNCH(adam_kernel<S>, dim3(blocks), dim3(kThreads), 0, stream, a);
@@ -301,7 +301,7 @@ template <class S> void learn_exposure(const LearnExposure<S>& a, Stream stream)
 #define BT_INSTANTIATE(S)                                                     \
   template int64_t picture_workspace<S>(int, int);                            \
   template void learn_exposure(const LearnExposure<S>&, Stream);              \
-  template void adam(const AdamRow<S>*, int, Stream);                         \
+  template void adam(const AdamParameter<S>*, int, Stream);                   \
   template void picture_loss(const PictureLoss<S>&, Stream);                  \
   template void picture_loss_backward(const PictureLossBackward<S>&, Stream); \
   template void accumulate_statistics(const DensifyStatistics<S>&, Stream);

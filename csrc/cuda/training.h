@@ -90,7 +90,7 @@ template <class S> void accumulate_statistics(const DensifyStatistics<S>& a, Str
 
 // A parameter of `count` numbers in rows of `width`, and Adam's state of it. The update of a row is multiplied by its
 // factor; null: 1. step [1] is the number of steps done.
-template <class S> struct AdamRow {
+template <class S> struct AdamParameter {
   S *parameter, *mean, *square;
   float* step;
   const S *gradient, *factors;
@@ -107,8 +107,8 @@ template <class S> struct AdamRow {
     r.numbers("rate", rate, "beta1", beta1, "beta2", beta2, "eps", eps);
   }
 };
-// Takes an Adam step on `count` parameters, kAdamRows of them per launch.
-constexpr int kAdamRows = 16;
-template <class S> void adam(const AdamRow<S>* rows, int count, Stream stream);
+// Takes an Adam step on `count` parameters, kAdamParameters of them per launch.
+constexpr int kAdamParameters = 16;
+template <class S> void adam(const AdamParameter<S>* parameters, int count, Stream stream);
 
 }  // namespace bt::cuda

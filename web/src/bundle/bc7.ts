@@ -117,8 +117,10 @@ function decodeBlock(data: Uint8Array, start: number, out: Uint8Array, to: numbe
   let number = 0;
   while (number < 8 && !bits.take(1)) number++;
   const m = MODES[number];
-  for (let texel = 0; texel < 16 && !m; texel++) out.fill(0, to + (texel >> 2) * row + (texel & 3) * 4, 4);
-  if (!m) return;
+  if (!m) {
+    for (let y = 0; y < 4; y++) out.fill(0, to + y * row, to + y * row + 16);
+    return;
+  }
   const partition = bits.take(m.partition);
   const rotation = bits.take(m.rotation);
   const selector = bits.take(m.selector);

@@ -7,7 +7,6 @@ const NEEDS =
 
 export interface Graphics {
   device: GPUDevice;
-  name: string;
   blocks: boolean; // BC7 textures
   floats: boolean; // rgba32float can be blended and filtered
   software: boolean; // software adapter
@@ -22,7 +21,7 @@ export async function openDevice(): Promise<Graphics> {
   const features = wanted.filter((name) => adapter.features.has(name));
   const { maxTextureDimension2D, maxTextureArrayLayers, maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
   const { maxComputeWorkgroupsPerDimension } = adapter.limits;
-  const { architecture, device: deviceName, description, vendor } = adapter.info;
+  const { architecture, device: name, description } = adapter.info;
   const device = await adapter.requestDevice({
     requiredFeatures: features,
     requiredLimits: {
@@ -32,11 +31,9 @@ export async function openDevice(): Promise<Graphics> {
   });
   return {
     device,
-    name: description || deviceName || vendor || 'unnamed',
     blocks: features.includes(wanted[0]),
     floats: features.includes(wanted[1]) && features.includes(wanted[2]),
-    software:
-      adapter.info.isFallbackAdapter || /swiftshader|llvmpipe/i.test(`${architecture} ${deviceName} ${description}`),
+    software: adapter.info.isFallbackAdapter || /swiftshader|llvmpipe/i.test(`${architecture} ${name} ${description}`),
   };
 }
 

@@ -8,7 +8,7 @@ const TEXEL_BYTES = 12; // per texel while decoding: three coefficients
 const GIGABYTE = 2 ** 30;
 const UNKNOWN_MEMORY = 4; // gigabytes, if the browser does not tell
 const SHARE = 0.5; // of the device's memory for a page
-const GROUP = 64; // surfels per workgroup of prepare.wgsl
+export const GROUP = 64; // surfels per workgroup of prepare.wgsl
 
 export type Limits = Pick<
   GPUSupportedLimits,

@@ -4,7 +4,7 @@ import type { View } from '../view/pose';
 import { type Part, type Sampling, isFar, partOf, samplingOf, sizeOf } from '../view/size';
 import type { Graphics } from './device';
 import { type Programs, SHOW, type Show, type TargetFormat } from './programs';
-import { type SceneOnDevice, STRIDE, group } from './scene';
+import { FRAME_BYTES, type SceneOnDevice, STRIDE, group } from './scene';
 
 export interface DrawOptions {
   show: Show;
@@ -104,7 +104,7 @@ export class Renderer {
 
   private setFrame(view: View, width: number, height: number, photoPixel: number, options: DrawOptions): void {
     const { info, surfels, atlasSize, alphaScale, count } = this.scene;
-    const data = new ArrayBuffer(160);
+    const data = new ArrayBuffer(FRAME_BYTES);
     const [f, u] = [new Float32Array(data), new Uint32Array(data)];
     const { right, down, forward } = view.pose;
     [right, down, forward].forEach((row, k) => f.set(row, 4 * k));

@@ -5,6 +5,7 @@ import type { Manifest } from '../bundle/manifest';
 import { SURFEL_WORDS, type Surfels, WORD } from '../bundle/surfels';
 import { tooLarge } from '../errors';
 import type { Graphics } from './device';
+import { GROUP } from './limits';
 import { type Programs, SORT_ENTRIES, type SortEntry } from './programs';
 
 export const MOST_LAYERS = 64;
@@ -12,7 +13,7 @@ export const STRIDE = 256; // offset alignment of the batches' uniforms
 const BLOCK = 1024; // of sort.wgsl: keys per block, digits, rounds
 const DIGITS = 16;
 const ROUNDS = 8;
-const FRAME_BYTES = 160;
+export const FRAME_BYTES = 160;
 const NO_OPACITY = -1e4; // logit
 
 type Resource = GPUBuffer | GPUTextureView | GPUSampler;
@@ -213,7 +214,7 @@ export class SceneOnDevice {
       work.setBindGroup(0, bound);
       work.dispatchWorkgroups(groups);
     };
-    run(this.programs.prepare, this.preparing, Math.ceil(Math.max(1, this.count) / 64));
+    run(this.programs.prepare, this.preparing, Math.ceil(Math.max(1, this.count) / GROUP));
     for (const round of this.rounds) {
       run(this.programs.sort.count, round.count, this.blocks);
       run(this.programs.sort.scan, round.scan, 1);

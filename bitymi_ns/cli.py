@@ -288,8 +288,8 @@ class ViewBundle:
     one_file: Flag = False  # With --export: write the bundle as one file, which the page reads by range requests.
     overwrite: Flag = False  # Replace an exported page.
     host: str = "127.0.0.1"
-    """Address to listen at. On an address other than loopback, everyone who can reach this machine sees the bundle."""
-    port: int = 0  # Port to listen at; 0 = any free port.
+    """Address to listen on. On an address other than loopback, everyone who can reach this machine sees the bundle."""
+    port: int = 0  # Port to listen on; 0 = any free port.
     open_browser: bool = True  # Open the page in the browser.
 
     def run(self) -> None:

@@ -26,7 +26,7 @@ Tell = Callable[[str], None]  # receives a warning for the user
 
 
 class Busy(BlockingIOError):
-    """Another process writes the same file or folder; `who` names it, if known, and says what to do."""
+    """Error if another process writes the same file or folder; `who` names it, if known, and says what to do."""
 
     def __init__(self, who: str) -> None:
         super().__init__(errno.EAGAIN, who)

@@ -85,7 +85,7 @@ class Parts:
 
     @contextmanager
     def opened(self, name: str) -> Iterator[tuple[IO[bytes], int]]:
-        """Open a file unread; yields it and its size in bytes.
+        """Open a file; yield it and its size in bytes.
 
         Raises:
             BundleError: missing or unreadable.

@@ -194,7 +194,8 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
 
 
 def _read_whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
-    """Read the `size` bytes of a file after `head`, feeding `sha256`; returns nothing of it unless `keep`."""
+    """Read a file of `size` bytes, of which `head` is read already, and feed them to `sha256`; return them if `keep`,
+    else nothing."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
     view = memoryview(data)
     view[:at] = head
@@ -289,7 +290,7 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
 
 
 def _byte_pages(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
-    """Round coded texels to pages [layers, height, width, 4] uint8; rounding first moves one int32 per texel."""
+    """Decode texels to pages [layers, height, width, 4] uint8; rounded first, a texel is scattered as one int32."""
 
     def whole(colors: np.ndarray, alphas: np.ndarray | None) -> np.ndarray:
         rgba = np.full((len(colors), 4), 255, dtype=np.uint8)

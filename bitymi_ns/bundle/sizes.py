@@ -15,8 +15,8 @@ from bitymi_ns.files import size_text
 SCENE_FILES = frozenset((SURFELS, ATLAS, COMPACT_SURFELS, TEXELS))  # surfels and texels
 HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # leading bytes that `check_head` reads
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
-"""Bytes of memory for decoding a compact bundle; measured: 370 per surfel (2 million), 165 per term (4 million), 67 per
-texel with its pages (17 million)."""
+"""Lower bounds of the memory for decoding a compact bundle, in bytes; measured: 370 per surfel (2 million), 165 per
+term (4 million), 67 per texel with its pages (17 million)."""
 
 
 def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
@@ -77,7 +77,7 @@ def least_memory(info: Manifest, name: str) -> int:
 
 
 def machine_memory() -> int:
-    """Return the memory of this machine, or of this process's limit, in bytes."""
+    """Return the memory of this machine, or this process's limit if that is lower, in bytes."""
     return int(min(psutil.virtual_memory().total, memory_limit()))
 
 

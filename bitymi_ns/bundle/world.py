@@ -53,7 +53,7 @@ class World:
     metres_per_unit: float | None = None  # length of a unit of the capture frame; None: unknown
 
     def described(self) -> dict[str, Any]:
-        """Convert to `WorldEntry`, with up and length in the scene frame."""
+        """Convert to the fields of `WorldEntry`, with up and length in the scene frame."""
         transform = np.asarray(self.transform, dtype=np.float64)[:3]
         frame: dict[str, Any] = {"transform": transform, "scale": float(self.scale)}
         if self.up is not None:

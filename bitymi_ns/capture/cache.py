@@ -19,14 +19,14 @@ from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
 FOLDER = ".bitymi"
 OF = "of.json"  # file in a work folder with its source and key
 Kind = Literal["poses", "points", "frames"]
-"""Content of a work folder, and begin of its name: poses, points of known poses, or frames of a video with known poses.
-A file of that name marks the latter two as complete."""
+"""Content of a work folder, and the start of its name: poses, points of known poses, or frames of a video with known
+poses. A file of that name marks the latter two as complete."""
 IN_USE = ".in-use-"  # prefix of the locks of reading processes
 VERSION = 5  # increase to invalidate cached poses when equal input gives others
 
 
 def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
-    """Hash files, each with its name in the capture, its size and time of change, and settings (plain values)."""
+    """Hash names in the capture, sizes and modification times of files, and settings (plain values)."""
     stats = [(name, path.stat()) for name, path in inputs]
     content = [VERSION, [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats], settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
@@ -91,9 +91,10 @@ def made_once(photographs: Path, key: str, kind: Kind, tell: Tell, make: Callabl
 
 
 def replace_stale(work: Path, photographs: Path, contents: str) -> None:
-    """State the source of a locked work folder, and remove folders of an earlier state of it, whose keys cannot recur.
-    Keep those of other options, on which runs were trained, and those in use. `contents`: key of the files alone."""
-    source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # lasts if both move
+    """Record the source of a locked work folder, and remove the folders beside it of earlier contents of this source,
+    whose keys cannot recur. Keep those of other options, on which runs were trained, and those in use. `contents`: key
+    of the source's files alone."""
+    source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # relative: both may move
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
         if other != work and is_own(other) and _is_stale(other, source, contents):

@@ -26,7 +26,7 @@ from bitymi_ns.trust import listed
 
 FORMS = (".txt", ".bin")
 MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a twentieth of it
-PROBE = 1 << 20  # bytes by which a disk shows that it is full
+PROBE = 1 << 20  # bytes to write to find out why writing failed
 TINY = 1e-100  # least length of a quaternion that can be normalised
 CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 T = TypeVar("T")
@@ -54,8 +54,8 @@ class Model(NamedTuple):
 
 
 def read_model(folder: Path) -> Model:
-    """Read a model, in text as nerfstudio does if there are both forms; warn if they differ. Several commands of a run
-    read it: the last one is cached. Raises CaptureError: it cannot be used; names file and entry."""
+    """Read a model; of both forms the text, as nerfstudio does, with a warning if they differ. The last model is
+    cached, because a run reads it several times. Raises CaptureError: it cannot be used; names file and entry."""
     names = [f"{name}{form}" for name in ("cameras", "images", "frames", "points3D") for form in FORMS]
     files = [*(folder / name for name in names), folder / "points3D.ply"]
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
@@ -84,7 +84,7 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
             first = f"the first is point {np.argmin(finite) + 1}"
             warn(f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, {first}, are not finite. They are left out.")
             xyz, rgb = xyz[finite], rgb[finite] if len(rgb) else rgb
-    elif (cloud := folder / "points3D.ply").is_file():  # as programs leave it that have read the model
+    elif (cloud := folder / "points3D.ply").is_file():  # written by programs that have read the model
         (xyz, rgb), without_colors = read_cloud(cloud, "Copy it again, or move it away to have points triangulated.")
     # nerfstudio sorts paths, not text: sort alike to hold the same photographs out
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
@@ -94,8 +94,8 @@ forget_model = _read_model.cache_clear
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in binary form. Raises OSError: it is not whole. COLMAP ignores failed writes, hence its files are
-    read again, not by COLMAP, whose reader does not end on some that are cut off."""
+    """Write a model in binary form, and read it back, because COLMAP ignores failed writes; not with COLMAP, whose
+    reader does not end on some truncated files. Raises OSError: a file is incomplete."""
     readers = {
         "rigs": _rigs_binary,
         "cameras": _cameras_binary,
@@ -108,17 +108,17 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
         for name, read in readers.items():
             tuple(read(folder / f"{name}.bin"))
     except (ValueError, struct.error) as error:
-        for name in readers:  # the reason is lost: writing more has the system state it
+        for name in readers:  # COLMAP has lost the reason: write more to have it reported
             with open(folder / f"{name}.bin", "ab") as file:
                 file.write(bytes(PROBE))
                 file.flush()
                 os.fsync(file.fileno())
-        raise OSError(errno.EIO, os.strerror(errno.EIO), str(folder)) from error  # a failure that has passed
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(folder)) from error  # the reason no longer holds
 
 
 def _file(folder: Path, name: str) -> Path:
-    """Choose the text or binary file, all of a form that is complete: a single file of the other form is of another
-    time."""
+    """Choose the text or the binary file of a model: of the form with both cameras and images, because a lone file of
+    the other form is from another export."""
 
     def is_complete(form: str) -> bool:
         return all((folder / f"{each}{form}").is_file() for each in ("cameras", "images"))
@@ -213,7 +213,7 @@ def _line_of(path: Path, number: int) -> str:
 
 
 class _Binary:
-    """Reads a binary file in sequence; fails if it has less or more than it states."""
+    """Sequential reader of a binary file; fails if it has less or more than it states."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.offset = read_bytes(path, MOST_MODEL), 0

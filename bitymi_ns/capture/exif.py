@@ -87,7 +87,7 @@ EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISO
 
 
 def exposure_exif(image: Image.Image) -> Image.Exif:
-    """Make EXIF of an opened image's exposure alone, without orientation and position."""
+    """Copy the exposure tags of an opened image to new EXIF, without orientation and position."""
     kept = Image.Exif()
     try:
         detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
@@ -121,7 +121,7 @@ def exif_stops(seconds: float, f_number: float, iso: float) -> float:
 def _up(
     image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
 ) -> tuple[float, float, float] | None:
-    """Find up by a phone's accelerometer; None = none stated, the phone moved, or the photograph is shown in another
+    """Find up from a phone's accelerometer; None = none stated, the phone moved, or the photograph is shown in another
     orientation."""
     note = detail.get(ExifTags.Base.MakerNote)
     if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
@@ -132,7 +132,7 @@ def _up(
     left, bottom, into = (value / math.hypot(*found) for value in found)
     # the sensor's rows run from top to bottom of the phone, its columns from right to left
     turns = {1: (bottom, left), 3: (-bottom, -left), 6: (-left, bottom), 8: (left, -bottom)}
-    # HEIC is turned as it is opened
+    # Pillow turns HEIC on opening, and keeps its orientation here
     orientation = image.info.get("original_orientation") or tags.get(ExifTags.Base.Orientation, 1)
     if orientation not in turns:
         return None
@@ -142,8 +142,8 @@ def _up(
 
 
 def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
-    """Parse AccelerationVector (tag 8) of Apple's maker note, in g: towards the left side of the phone as seen from its
-    front, its bottom, and into its face. Of a phone held still it points away from the ground.
+    """Parse AccelerationVector (tag 8) of Apple's maker note, in g. Its axes point to the phone's left side as seen
+    from its front, to its bottom, and into its face. For a phone held still it points away from the ground.
 
     The note has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its
     start.

@@ -71,7 +71,7 @@ OTHER_FILES = {
 def open_picture(file: Path) -> Image.Image:
     """Open a photograph or mask with Pillow; raises errors of Pillow's and of `open_regular`."""
     open_regular(file).close()
-    Image.init()  # AVIF came with a later version of Pillow
+    Image.init()  # loads all formats; earlier versions of Pillow have no AVIF
     return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
 
@@ -134,8 +134,8 @@ def videos_in(folder: Path, rendered: bool = False) -> list[Path]:
 
 
 def _skipped(parent: Path, below: Collection[str]) -> dict[str, str]:
-    """Map names of folders below a searched one to what they hold if they are not searched; empty = search them.
-    Captures beside photographs hold copies of these."""
+    """Map the names of a folder's subfolders to what they hold if they are not searched; empty = search them. Captures
+    in subfolders beside photographs are skipped, because they hold copies of these."""
     found = {name: no_photographs(parent / name, below) for name in sorted(below)}
     marks = {name: parent / name / "transforms.json" for name, what in found.items() if not what}
     captures = [name for name, file in marks.items() if holds(file, b'"transform_matrix"')]

@@ -78,8 +78,8 @@ def move_to_world(
 ) -> WorldFrame:
     """Transform a model in place to a world with z up.
 
-    Up is by accelerometers if most agree, else by GPS if that is enough, else by the cameras; scale and north are by
-    GPS if that is enough.
+    Up is that of the accelerometers if most agree, else GPS's if its positions determine it, else the cameras' mean;
+    scale and north are GPS's if its positions determine them.
 
     Args:
         gps: latitude, longitude and altitude by name.
@@ -112,7 +112,7 @@ def _gps_error(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.nd
 
 
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
-    """Average up [3] by accelerometers in the model's world; None unless three or more, and most of them, agree."""
+    """Average the accelerometers' up [3] in the model's world; None unless three or more, and most of them, agree."""
     images = [image for image in model.images.values() if image.has_pose and image.name in ups]
     found = [image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name]) for image in images]
     if len(found) < 3:
@@ -153,12 +153,12 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> pycolmap.Sim3d | None
 
 
 def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray | None) -> pycolmap.Sim3d:
-    """Make the similarity that turns `up` (None = the cameras' mean) to z, and scales the cameras' middle to the origin
-    and their mean distance from it to 1."""
+    """Make the similarity that turns `up` (None = the cameras' mean) to z, moves the cameras' mean position to the
+    origin, and scales their mean distance from it to 1."""
     turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
     if up is None:
         up = -np.mean([turn[1] for turn in turns], axis=0)
-        if np.linalg.norm(up) < 0.1:  # they are turned all ways
+        if np.linalg.norm(up) < 0.1:  # the cameras' ups cancel
             up = -turns[0][1]
         up /= np.linalg.norm(up)
     side = np.mean([turn[0] for turn in turns], axis=0)

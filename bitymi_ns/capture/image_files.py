@@ -101,7 +101,7 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
 
 
 def check_sizes(paths: Sequence[Path]) -> None:
-    """Fail at photographs of more than MAX_PIXELS, by their headers."""
+    """Fail if the header of a photograph states more than MAX_PIXELS."""
 
     def too_large(path: Path) -> bool:
         try:
@@ -133,8 +133,8 @@ def check_orientation(paths: Sequence[Path]) -> None:
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
-    """Read a photograph as 8-bit sRGB, mode RGB, or RGBA with transparency. Deep grey is scaled to 8 bits, which PIL
-    would clip to white.
+    """Read a photograph as 8-bit sRGB, mode RGB, or RGBA with transparency. Grey of more than 8 bits, which PIL would
+    clip to white, is scaled to 8 bits.
 
     Args:
         stored: width and height that it must have; None = any.
@@ -162,7 +162,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Scale deep grey modes to 8 bits, with their EXIF orientation. Raises ValueError: their range is unknown."""
+    """Scale grey of more than 8 bits to 8 bits, keeping the EXIF orientation. Raises ValueError: the range is
+    unknown."""
     if not image.mode.startswith(("I", "F")):
         return image
     values = np.asarray(image, dtype=np.float64)

@@ -35,7 +35,7 @@ LEAST_SHARE = 0.05  # drop faces with a smaller covered share: strips at the edg
 ANGLES, AZIMUTHS = 360, 64  # rays for testing where the distortion folds the picture
 SAMPLES = 2  # samples along a side of a face's pixel: one would alias where photographs are denser, as at their poles
 BAND = 256  # rows of a face that are resampled together
-PAD = 2  # columns of the other edge that continue a picture of all directions
+PAD = 2  # columns by which a 360-degree picture is continued at each side, from the other side
 CACHED_MAPS = 4  # lenses whose remapping tables are cached; 72 MB for 12 megapixels
 DOUBTFUL_AREA, ABSURD_AREA = 0.25, 0.05  # warn or fail if undistorting leaves a smaller share of the photograph
 
@@ -66,7 +66,7 @@ class Pinhole(NamedTuple):
 
 @dataclass(frozen=True)
 class Lens:
-    """Resamples a photograph, or a face of the cube around a wide camera, to a pinhole picture."""
+    """Resampling of a photograph, or of a face of the cube around a wide camera, to a pinhole picture."""
 
     camera: ColmapCamera  # of the photograph, for the size to which it is downscaled first
     stored: tuple[int, int]  # width and height of the image file

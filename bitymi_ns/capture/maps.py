@@ -24,8 +24,8 @@ from bitymi_ns.reading import open_regular
 
 MILLIMETER = 1e-3  # metres per unit of integer depth unless stated: nerfstudio's convention
 MAPS = "maps"  # metadata key of the views' `MapFiles`
-COLOR_SAMPLES = 8  # files of a scanner's depth that are tested for color; all have to be color pictures
-MOST_LARGER = 8  # largest side of a map in sides of its photograph, which may be a reduced copy
+COLOR_SAMPLES = 8  # files of a folder of depth that are tested; if all are color pictures, it is not used
+MOST_LARGER = 8  # largest ratio of a map's side to its photograph's, which may be a reduced copy
 MOST_NUMBERS = 1 << 28  # most numbers of a map: 80 million normals, or 260 million depths
 FARTHEST = 65504.0  # depth from which on numbers mean "no depth": the largest half float, below Blender's 1e10
 
@@ -33,7 +33,7 @@ Check = Callable[[tuple[int, ...]], None]
 """Receives a header's shape, and raises if it must not be read."""
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 EXR = b"v/1\x01"
-cv2.setLogLevel(0)  # a damaged map is one message, without OpenCV's own lines
+cv2.setLogLevel(0)  # a damaged map gets one message, without OpenCV's own
 _PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
 
 Values = npt.NDArray[np.float32]
@@ -61,7 +61,7 @@ def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
 
 
 def _is_color(path: Path) -> bool:
-    """Test for an image of integers in differing channels, which is no depth."""
+    """Test for an integer image whose channels differ, which is no depth."""
     if path.suffix.lower() not in (".png", ".tif", ".tiff"):
         return False
     try:
@@ -81,7 +81,7 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
     """Read camera z [H, W] for the pinhole picture of a lens, by nearest neighbors; 0 = unknown.
 
     Integers are millimetres, 0 and the largest one unknown. Floating-point numbers are metres; unknown unless finite,
-    above 0 and below 65,504. A confidence of 0 means unknown. `unit`: metres per unit instead.
+    above 0 and below 65,504. A confidence of 0 means unknown. `unit` overrides the metres per unit.
 
     Raises:
         CaptureError: a file cannot be read, or has another shape than the photograph.
@@ -152,7 +152,7 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
                 raise ValueError("it is no image that OpenCV reads")
             check(values.shape)
             if values.ndim == 3:
-                values = values[..., [2, 1, 0] if _channels_differ(values) else 0]  # grey: depth, as a program wrote it
+                values = values[..., [2, 1, 0] if _channels_differ(values) else 0]  # equal: depth, written as grey
     if values.dtype.kind not in "iuf":
         fail(f"{path} is no map of numbers, but of {values.dtype}. {_WITHOUT}")
     return values.astype(np.float32) if values.dtype.itemsize > 4 or values.dtype == np.float16 else values

@@ -76,8 +76,8 @@ def read_mask(path: Path) -> Image.Image:
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
     """Threshold a mask to the pixels [H, W] that count: opaque and not black, or above MIDDLE for lossy formats.
 
-    Masks of zeros and ones or of class numbers need this, as COLMAP and nerfstudio do it. JPEG ripples around an edge
-    are a few levels above black, but stay below MIDDLE.
+    As in COLMAP and nerfstudio, masks may hold zeros and ones, or class numbers. JPEG ripples around an edge are a few
+    levels above black, but stay below MIDDLE.
     """
     if image.mode.startswith(("I", "F")):
         result = np.asarray(image) != 0

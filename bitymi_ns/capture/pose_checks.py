@@ -130,7 +130,7 @@ def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
 
 
 def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Fail or warn at single cameras far from all others; centers [N, 3] finite, `names` for messages."""
+    """Warn of single cameras far from all others, or fail; centers [N, 3] finite, `names` for messages."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     order = np.argsort(distances)
     sorted_distances = distances[order]

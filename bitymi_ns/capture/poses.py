@@ -31,8 +31,8 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.reading import read_json
 
 GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
-TELLING = 0.25  # least share of 360-degree pictures in a size for all of it to count as 360-degree
-LEAST = 3  # photographs
+TELLING = 0.25  # least share of 360-degree pictures among photographs of a size for all of them to count as such
+LEAST = 3  # fewest photographs
 SPARSE = Path("sparse/0")  # the model's path in a result
 
 
@@ -95,7 +95,7 @@ def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
             f"{folder} holds {held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take "
             f"photographs of which each shares at least two thirds with the one before.{also}"
         )
-    below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if this folder were named
+    below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if their common folder were given
     return source, folder / below, [os.path.relpath(name, below) for name in names]
 
 

@@ -112,7 +112,7 @@ class Capture:
     lists: NameLists = field(default_factory=dict)  # its own lists for training and evaluation
     parts: dict[str, Sequence[int]] = field(default_factory=dict)  # photographs of "train", and held out "val", "test"
     downscale: int = 1  # factor by which photographs are reduced
-    applied: Pose | None = None  # [4, 4] that its files state as applied, and scale
+    applied: Pose | None = None  # transform [4, 4] that its files state as applied, with a scale
     applied_scale: float = 1.0
     report: Path | None = None  # folder of the report on structure from motion; None = none
     model: Source | None = None  # found by structure from motion; None = the capture came with poses
@@ -189,7 +189,7 @@ class _Reader:
                 fail(f"{read.path}: orientation_override is {meta['orientation_override']!r}, none of {allowed}.")
             frame = replace(frame, orientation_method=meta["orientation_override"])
             say(f"{read.path} asks for the orientation method {frame.orientation_method}.")
-        earlier = found.folder / "colmap/sparse/0"  # in which nerfstudio's tool left points, before it stated either
+        earlier = found.folder / "colmap/sparse/0"  # points of nerfstudio's tool before it stated either
         applied, own = meta.get("applied_transform"), None
         if applied is None and earlier.is_dir():
             applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
@@ -242,8 +242,8 @@ class _Reader:
         return Capture(found.format, source, photographs, points, self.options, downscale=self.downscale)
 
     def _blender(self) -> Capture:
-        """Read a Blender data set with its own split. If one of its two files of held-out views is missing, or all its
-        photographs are, the other serves for it; if both are, there is no split."""
+        """Read a Blender data set with its own split. If one of the val and test files is missing, or lacks all its
+        photographs, the other serves for both; without either there is no split."""
         options, found, need_photos = self.options, self.found, self.need_photos
         train = self._read_transforms(found.folder / "transforms_train.json")
         if need_photos:

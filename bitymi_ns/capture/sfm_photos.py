@@ -1,6 +1,7 @@
 """Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each.
 
-Metadata or content tell 360-degree (equirectangular) pictures; phones take other photographs with an aspect ratio of 2.
+360-degree (equirectangular) pictures are told by metadata or content, not by their aspect ratio of 2 alone: phones take
+other photographs with it.
 """
 
 import os
@@ -38,7 +39,7 @@ SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirec
 ALIKE = 0.6  # least correlation of the details of matching left and right edges
 SMOOTH = 15  # rows of the moving average that is subtracted to leave detail
 DETAIL = 1.5  # least standard deviation of detail, grey levels: bare edges always match
-POLE = 0.35  # largest standard deviation of the first and last row, points of the sphere, relative to the picture's
+POLE = 0.35  # largest standard deviation of the first and last row, the sphere's poles, relative to the picture's
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,7 @@ def _reduced(image: Image.Image, size: int) -> Image.Image:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Divide the root mean squares of Laplacian and gradient of [h,w] float32: low without fine detail."""
+    """Compute the ratio of the root mean squares of Laplacian and gradient of [h,w] float32: low without detail."""
     right, down = np.diff(grey, axis=1), np.diff(grey, axis=0)
     gradient = float(np.mean(right**2) + np.mean(down**2))
     laplacian = float(np.mean(np.diff(right, axis=1) ** 2) + np.mean(np.diff(down, axis=0) ** 2))
@@ -216,8 +217,8 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
 
 
 def shift(first: np.ndarray, second: np.ndarray) -> float:
-    """Divide the root mean squares of the difference of two images [h,w] and of their gradient: the shift in pixels
-    that explains it."""
+    """Estimate the shift, in pixels, that explains the difference of two images [h,w]: the root mean square of the
+    difference over that of the gradient."""
     gradient = np.mean(np.diff(first, axis=0) ** 2) + np.mean(np.diff(first, axis=1) ** 2)
     difference = np.mean((first - second) ** 2)
     return float(np.sqrt(difference / gradient)) if gradient > 0 else (0.0 if difference == 0 else np.inf)

@@ -50,7 +50,7 @@ DISTORTION = (*COEFFICIENTS, "distortion_params")
 FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
 """Entries of a focal length: in pixels, or by the view angle in radians, or in degrees."""
 STATED_BY = {"fl_x": FOCALS["x"], "fl_y": (*FOCALS["y"], *FOCALS["x"][1:])}
-"""Entries that serve as another; an angle of one side assumes square pixels."""
+"""Entries that may stand for another; an angle of one side assumes square pixels."""
 EQUAL_AREA = ("equirectangular", "is_equirectangular")  # instant-ngp's entries for 360-degree rows of equal areas
 USED = {
     "frames", *FILE_KEYS, "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",

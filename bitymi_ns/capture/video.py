@@ -163,7 +163,7 @@ def _pace(video: Path) -> tuple[float, float, int]:
 def _opened(video: Path) -> av.container.InputContainer:
     try:
         open_regular(video).close()
-        container = av.open(os.path.abspath(video), options=TRUSTED)  # a relative one may begin like an address
+        container = av.open(os.path.abspath(video), options=TRUSTED)  # a relative path may begin like a URL
     except (av.FFmpegError, OSError, ValueError) as error:
         raise CaptureError(
             f"{video} cannot be read as a video ({error.strerror or error}): record or export it again"

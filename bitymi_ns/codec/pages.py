@@ -22,7 +22,7 @@ def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
     Returns:
         list of (r_u, r_v, rows [M] int64), sizes ascending, without surfels that have no tile.
     """
-    # packed into one integer: torch.unique over rows is many times slower
+    # one integer per pair: torch.unique over rows is many times slower
     keys, inverse = torch.unique((sizes[:, 0].long() << 32) + sizes[:, 1].long(), return_inverse=True)
     found = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
     return [

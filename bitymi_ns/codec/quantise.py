@@ -176,7 +176,7 @@ def encode(
 
 
 def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: int) -> np.ndarray:
-    """Unpack an encoded atlas to stored texels [layers, height, width, 4]: uint8 for bc7 and uint8, float16 for fp16.
+    """Decode an atlas's pages to stored texels [layers, height, width, 4]: uint8 for bc7 and uint8, float16 for fp16.
 
     Raises:
         ValueError: a page has the wrong number of bytes.

@@ -17,7 +17,7 @@ from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
 Codes = npt.NDArray[np.int64]
 
 POSITION_BITS = 17  # bits per axis of a position: three axes fit exactly into a float64
-SMALLEST_SHARE = 1.0 / 1024  # margin of opacities and betas to 0 and 1, where the logit is infinite
+SMALLEST_SHARE = 1.0 / 1024  # margin of opacities to 1, and of betas to 0 and 1, where the logit is infinite
 REFERENCE: dict[str, float] = {
     "place": 1.0 / 512,
     "rotation": 1.0 / 128,

@@ -13,9 +13,9 @@ LINK = 15  # points seen together that link two photographs; COLMAP's least numb
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Remove arbitrary poses: of cameras that points do not link to most others.
+    """Remove the poses of cameras that too few points link to the largest group: they are arbitrary.
 
-    Mappers find them by directions between pairs, whose points the filters may have removed.
+    Mappers register such cameras by directions between pairs, whose points the filters may have removed.
     """
     placed = [image for image in model.images.values() if image.has_pose]
     column = {image.image_id: i for i, image in enumerate(placed)}

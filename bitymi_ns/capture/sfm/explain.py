@@ -12,11 +12,13 @@ from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
 from bitymi_ns.capture.types import SPHERICAL_MODEL
 
 FEW_FEATURES = 60  # features of a photograph with hardly any detail
-PARALLAX = 1.0  # largest angle in degrees between rays to the points of photographs from one spot
-ROTATED = 2.0  # pixels of the images with features within which a turn alone explains a match
-MOST = 0.9  # least share of a pair's matches, and of the pairs, that a turn explains; fewer: a far background
+PARALLAX = 1.0  # largest parallax (`parallax`) of photographs from one spot, degrees
+ROTATED = 2.0  # error up to which a rotation alone explains a match, in pixels of the images with features
+MOST = 0.9
+"""Least share of a pair's matches, and of the pairs, that a rotation explains if the camera only turned: if it moved
+before a far background, a rotation explains fewer."""
 PAIRS_TRIED = 60
-TELLING = 30  # least matches of a pair that tell a turn from a step
+TELLING = 30  # fewest matches of a pair that tell a rotation from a translation
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)  # unknown focal lengths, in longer sides
 
 SHOOT = (
@@ -114,7 +116,7 @@ def parallax(model: pycolmap.Reconstruction) -> float:
 
 
 def only_turned(job: Job, database: Path) -> bool:
-    """Test if a turn explains most pairs: the matches fit K R K^-1 for some focal length."""
+    """Test if a rotation explains most pairs: the matches fit K R K^-1 for some focal length."""
     groups = {name: group for group in job.cameras for name in group.names}
     with pycolmap.Database.open(database) as opened:
         images = {image.image_id: image for image in opened.read_all_images()}
@@ -150,7 +152,7 @@ def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndar
 
 
 def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
-    """Measure distances [n] in pixels of unit rays a, b [n, 3] after the best turn; `focal` in pixels per radian."""
+    """Measure distances [n] in pixels of unit rays a, b [n, 3] after the best rotation; `focal`: pixels per radian."""
     keep = np.ones(len(a), bool)
     for _ in range(3):  # least squares, then without the worst half, which has the wrong matches
         u, _, vt = np.linalg.svd(b[keep].T @ a[keep])

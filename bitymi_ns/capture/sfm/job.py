@@ -17,11 +17,11 @@ PAIRS = "pairs.txt"
 MODEL = "model"  # names in the work folder: COLMAP's database, pairs to match, and the resulting model
 
 MAX_ERROR = 4.0  # largest error of observations, in pixels of the images with features; COLMAP's own limit
-SERIAL = 100  # photographs up to which one thread maps, so that runs are equal; for 50, two are no faster
+SERIAL = 100  # most photographs that one thread maps, for equal results of equal runs; for 50, two are no faster
 
 
 class StageProgress(Protocol):
-    """Receives the stage, its progress and total, and the table whose rows count the progress from now on."""
+    """Receiver of the stage, its progress and total, and the database table whose rows count the progress from then."""
 
     def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None: ...
 
@@ -59,8 +59,8 @@ class Job:
 
     @property
     def threads(self) -> int:
-        """Threads of what locates cameras and points; -1 = all. Several add up in varying order, so that poses of equal
-        photographs differ by rounding, and in time by more."""
+        """Number of threads for mapping and triangulation; -1 = all. Several sum in varying order, so that poses of the
+        same photographs differ by rounding, which grows along the way."""
         return 1 if len(self.order) <= SERIAL else -1
 
     @property
@@ -90,4 +90,4 @@ class Job:
 
 
 class NoPoses(Exception):
-    """The photographs give no poses; the message says what to do."""
+    """Failure to find poses of the photographs; the message says what to do."""

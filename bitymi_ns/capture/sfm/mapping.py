@@ -1,5 +1,5 @@
-"""Map compared photographs: all cameras at once, else one after the other, and a last bundle adjustment; or points for
-known cameras."""
+"""Map matched photographs: all cameras at once, else one after the other, then bundle adjustment; or triangulate points
+for known cameras."""
 
 import copy
 import shutil
@@ -15,12 +15,12 @@ from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StagePr
 from bitymi_ns.capture.types import CONTRADICTED
 
 Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
-"""Maps a database's features and matches, with a folder for files; returns connected components."""
+"""Function that maps a database's features and matches, given a folder for files; returns connected components."""
 ENOUGH = 0.9  # share of the connected photographs in a global model that is good enough
 GOOD_ERROR = 1.0  # and its reprojection error, in pixels of the images with features, if few matches contradict it
 
 MIN_ANGLE = 1.5  # least angle between rays of a point with depth, degrees; COLMAP's own limit
-GAIN = 0.03  # least drop of the reprojection error by OPENCV: few observations may misuse its four terms
+GAIN = 0.03  # least relative drop of the reprojection error to choose OPENCV: few observations overfit its four terms
 OBSERVATIONS_PER_CAMERA = 2000  # least for OPENCV
 LEAST_POINTS = 10  # to start from
 
@@ -50,7 +50,7 @@ def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) ->
 
 
 def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> pycolmap.Reconstruction | None:
-    """Map, and refine the largest component's cameras that its points link."""
+    """Map, refine the largest component, and drop cameras that its points do not link."""
     with job.scratch() as folder:
         models = mapper(job, database, folder, tell)
     largest = max(models.values(), key=lambda model: model.num_reg_images(), default=None)
@@ -70,7 +70,7 @@ def _global(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict
     options.random_seed = 0
     options.num_threads = options.mapper.num_threads = job.threads
     options.mapper.bundle_adjustment.ceres.solver_options.num_threads = job.threads
-    copy = folder / "database.db"  # whose focal lengths change, but not for the other mapper
+    copy = folder / "database.db"  # its focal lengths change; the other mapper keeps the original
     shutil.copyfile(database, copy)
     calibration = pycolmap.ViewGraphCalibrationOptions()  # finds focal lengths, and wrong ones of EXIF
     calibration.random_seed = 0
@@ -103,7 +103,8 @@ def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) ->
 
 
 def refined(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
-    """Drop bad observations, adjust all cameras and points of a `model` in place, and drop again."""
+    """Drop bad observations, adjust all cameras and points of a `model` in place, and drop again; return it, or a copy
+    with OPENCV cameras if these fit clearly better."""
     _filter(model, job.pixel)
     if model.num_points3D() == 0:
         return model
@@ -140,7 +141,7 @@ def _filter(model: pycolmap.Reconstruction, pixel: float) -> None:
 
 
 def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
-    """Triangulate points by a job's known poses. Raises NoPoses: the photographs do not show the same by them."""
+    """Triangulate points with a job's known poses. Raises NoPoses: hardly any, so the poses may be wrong."""
     database = Path(job.work) / DATABASE
     features.extract(job, database, tell)
     pairs.match(job, database, tell)

@@ -12,19 +12,19 @@ from bitymi_ns.capture.sfm.job import PAIRS, Job, StageProgress
 from bitymi_ns.files import write_file
 
 FEW = 30  # most photographs that are all compared with all
-WORTH_ALL = 150  # most that are so if too few get a pose otherwise
+WORTH_ALL = 150  # most that are, if too few get a pose otherwise
 NEIGHBOURS = 20  # photographs that each is compared with, by likeness or by GPS
 COARSE_FEATURES = (256, 128)
-"""Largest features per photograph that decide on likeness, seen from afar and close by; of more than MANY photographs
-the second number."""
+"""Numbers of features per photograph that decide on likeness, for up to MANY photographs and for more: the largest,
+which are found from afar as well as close by."""
 MANY = 400
 COARSE_COSINE = 0.85  # least cosine between descriptors of like features, each the other's nearest
 SEQUENCE_NEIGHBOURS = 6
-SEQUENCE_SHARE = 0.8  # least share of neighbours in order that are most alike, in a sequence
+SEQUENCE_SHARE = 0.8  # least share of consecutive photographs in a sequence that are among each other's most alike
 
 
 def match(job: Job, database: Path, tell: StageProgress, every: bool = False) -> None:
-    """Choose pairs, or `every` one, and compare those not compared yet."""
+    """Choose pairs, or take `every` one, and match those not matched yet."""
     listed = Path(job.work) / PAIRS
     if every or not listed.exists():
         pairs = list(combinations(range(len(job.order)), 2)) if every else choose(job, database, tell)
@@ -107,7 +107,7 @@ def sequence(count: int) -> set[tuple[int, int]]:
 
 
 def is_sequence(alike: np.ndarray) -> bool:
-    """Test if neighbors in order are most alike."""
+    """Test if consecutive photographs are among the most alike."""
     count = len(alike)
     rank = [(alike[i] > alike[i, i + 1]).sum() for i in range(count - 1) if alike[i, i + 1] > 0]
     return sum(r < NEIGHBOURS / 2 for r in rank) >= SEQUENCE_SHARE * (count - 1)

@@ -24,7 +24,7 @@ _messages = sys.__stdout__  # the pipe of messages
 
 
 class Stages:
-    """Sends progress, and times every stage."""
+    """Sender of progress that times every stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

@@ -204,6 +204,8 @@ def main() -> int:
     capture = load_capture(arguments.data.expanduser())
     gsplat, why = load()
     if arguments.train:
+        if gsplat is None:
+            parser.error(f"--train needs gsplat: {why}")
         arguments.gaussians.mkdir(parents=True, exist_ok=True)
         for most in arguments.train:
             trained = train(gsplat, capture, most, arguments.steps, device)

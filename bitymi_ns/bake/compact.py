@@ -76,7 +76,9 @@ class Compact:
 
     def check(self) -> None:
         """Check the values; raise ValueError for one out of range."""
-        if not 0 < self.share < 1 or self.views < 1:
+        if self.views < 1:
+            raise ValueError(f"at least 1 view must be drawn, not {self.views}")
+        if not 0 < self.share < 1:
             raise ValueError(f"the share of the error must lie between 0 and 1, not at {self.share}")
         if self.most_bytes is not None and self.psnr is not None:
             raise ValueError("bytes and PSNR cannot be asked for together")

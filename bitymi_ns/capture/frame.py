@@ -60,14 +60,17 @@ def local_positions(
     middle; return that, too."""
     if not gps:
         return {}, None
-    middle = np.median(np.array(list(gps.values())), axis=0)
+    values = np.array(list(gps.values()))
+    if np.ptp(values[:, 1]) > 180:  # on both sides of the antimeridian
+        values[:, 1] %= 360
+    middle = np.median(values, axis=0)
     latitude = np.radians(middle[0])
     eccentricity = FLATTENING * (2 - FLATTENING)
     w = 1 - eccentricity * np.sin(latitude) ** 2
     north = EARTH * (1 - eccentricity) / w**1.5
     east = EARTH / np.sqrt(w) * np.cos(latitude)
-    values = np.array(list(gps.values()))
     local = np.column_stack([np.radians(values[:, 1::-1] - middle[1::-1]) * (east, north), values[:, 2] - middle[2]])
+    middle[1] -= 360 * (middle[1] > 180)
     return dict(zip(gps, local.tolist(), strict=True)), tuple(middle.tolist())
 
 

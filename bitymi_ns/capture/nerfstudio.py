@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.capture.report import FILES
+from bitymi_ns.capture.transforms import INTRINSICS
 from bitymi_ns.capture.types import FoundPoses
 from bitymi_ns.files import complete_folder, copy_files
 from bitymi_ns.ply import write_cloud
@@ -15,7 +16,6 @@ from bitymi_ns.progress import Progress
 from bitymi_ns.trust import inside
 
 CLOUD = "sparse_pc.ply"
-SIZES = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 
 
 def write_capture(poses: FoundPoses, folder: Path, progress: Progress) -> None:
@@ -72,4 +72,4 @@ def intrinsics(camera: pycolmap.Camera) -> dict[str, object]:
     distortion |= dict(zip(distortion, camera.params[first:].tolist(), strict=False))
     focal = (camera.focal_length_x, camera.focal_length_y)
     sizes = (camera.width, camera.height, *focal, camera.principal_point_x, camera.principal_point_y)
-    return {"camera_model": "OPENCV", **dict(zip(SIZES, sizes, strict=True)), **distortion}
+    return {"camera_model": "OPENCV", **dict(zip(INTRINSICS, sizes, strict=True)), **distortion}

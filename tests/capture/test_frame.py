@@ -29,6 +29,14 @@ def test_a_degree_is_as_long_as_it_is() -> None:
     assert local["c"] == pytest.approx([74.63, 111.20, 7.0], abs=0.02)
 
 
+@pytest.mark.parametrize("middle", [179.9998, -179.9999])
+def test_the_antimeridian_is_crossed(middle: float) -> None:
+    longitudes = [(middle + step + 180) % 360 - 180 for step in (-0.0005, 0.0, 0.0005)]
+    local, origin = local_positions({str(k): (48.0, longitudes[k], 0.0) for k in range(3)})
+    assert origin[1] == pytest.approx(middle, abs=1e-9)
+    assert [local[str(k)][0] for k in range(3)] == pytest.approx([-37.31, 0.0, 37.31], abs=0.02)
+
+
 def test_gps_gives_metres_and_up() -> None:
     model = synthetic()
     turned = pycolmap.Sim3d(0.05, pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])), np.array([4.0, 5.0, 6.0]))

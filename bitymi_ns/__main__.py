@@ -7,7 +7,7 @@ import warnings
 def main() -> int:
     """Run one command and return its exit status."""
     try:
-        from bitymi_ns import endings
+        from bitymi_ns import exit_messages
     except KeyboardInterrupt:
         return 130
 
@@ -19,7 +19,7 @@ def main() -> int:
 
         return cli.main()
 
-    return endings.run(command)
+    return exit_messages.run(command)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, TextIO
 
 import tyro
 
-from bitymi_ns import KernelsUnavailable, endings
+from bitymi_ns import KernelsUnavailable, exit_messages
 from bitymi_ns.capture.types import SfmOptions
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.measure.bench.cli import BenchRun
@@ -341,7 +341,7 @@ Command = (
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Errors that the user can correct print one line, no traceback."""
-    return endings.run(lambda: _run(args))
+    return exit_messages.run(lambda: _run(args))
 
 
 def _run(args: Sequence[str] | None) -> int:

@@ -18,8 +18,8 @@ from PIL import ExifTags, Image
 
 from bitymi_ns.capture import exif
 from bitymi_ns.capture.colmap_model import forget_model
+from bitymi_ns.capture.depth_normal_maps import read_depth, read_normal
 from bitymi_ns.capture.lens import lenses_of
-from bitymi_ns.capture.maps import read_depth, read_normal
 from bitymi_ns.capture.points import ply_fault, read_points
 from bitymi_ns.capture.types import CaptureError, ColmapCamera, MapFiles
 from bitymi_ns.measure.report.page import compose, to_page

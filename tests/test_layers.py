@@ -14,7 +14,18 @@ import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "codec", "bundle", "train", "bake", "interchange", "view", "plugin", "measure"]
-BESIDE = ["endings", "files", "ply", "presets", "progress", "ranges", "reading", "sample", "capture", "trust"]
+BESIDE = [
+    "exit_messages",
+    "files",
+    "ply",
+    "presets",
+    "progress",
+    "ranges",
+    "safe_reading",
+    "sample",
+    "capture",
+    "trust",
+]
 """Modules beside the layers (ORDER, innermost first); these import no layer."""
 KNOW_NERFSTUDIO = ("plugin", "host", "measure/pictures.py")
 

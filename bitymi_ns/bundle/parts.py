@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from bitymi_ns import reading
+from bitymi_ns import safe_reading
 from bitymi_ns.bundle.manifest import (
     ATLAS,
     COMPACT_SURFELS,
@@ -56,13 +56,13 @@ def public_manifest(info: Manifest, data: bytes) -> bytes:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file of a bundle for reading with `reading.open_regular`.
+    """Open a file of a bundle for reading with `safe_reading.open_regular`.
 
     Raises:
         BundleError: missing, not a regular file, or the system refuses it.
     """
     try:
-        return reading.open_regular(path)
+        return safe_reading.open_regular(path)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise MissingPart(f"{path} is missing") from error
     except OSError as error:
@@ -226,7 +226,7 @@ def instead_of(path: Path) -> str | None:
 def _is_archive(path: Path) -> bool:
     """Return True for a file with the signature of a bundle in one file."""
     try:
-        with reading.open_regular(path) as file:
+        with safe_reading.open_regular(path) as file:
             return file.read(4) == b"PK\3\4"
     except OSError:
         return False

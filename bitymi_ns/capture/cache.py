@@ -13,7 +13,7 @@ from typing import Literal
 from bitymi_ns import files
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, write_file
-from bitymi_ns.reading import read_json
+from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
 
 FOLDER = ".bitymi"

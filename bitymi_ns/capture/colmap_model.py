@@ -21,7 +21,7 @@ from bitymi_ns.capture.points import color_bytes, read_cloud
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.capture.transforms import MAX_SIDE
 from bitymi_ns.capture.types import ColmapCamera, fail, parsing, warn
-from bitymi_ns.reading import open_text, read_bytes
+from bitymi_ns.safe_reading import open_text, read_bytes
 from bitymi_ns.trust import listed
 
 FORMS = (".txt", ".bin")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pillow_heif
 from PIL import Image
 
-from bitymi_ns.reading import MOST_TEXT, open_regular
+from bitymi_ns.safe_reading import MOST_TEXT, open_regular
 from bitymi_ns.trust import listed
 
 pillow_heif.register_heif_opener()  # for all users of Pillow

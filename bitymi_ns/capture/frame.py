@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 
 from bitymi_ns.files import write_file
-from bitymi_ns.reading import read_json
+from bitymi_ns.safe_reading import read_json
 
 EARTH = 6378137.0  # equatorial radius in metres, WGS 84
 FLATTENING = 1 / 298.257223563

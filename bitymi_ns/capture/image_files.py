@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -248,31 +248,3 @@ def summarize(image: npt.NDArray[np.uint8]) -> ImageSummary:
     fingerprint = hashlib.sha256(repr(image.shape).encode() + sample.tobytes()).digest()
     empty = next((what for what, test in EMPTY.items() if test(sample) and test(image)), "")
     return ImageSummary(empty, fingerprint)
-
-
-Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
-
-
-def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:
-    """Pair files of the same bytes, reading only files of equal size."""
-    sizes = {path: path.stat().st_size for path in (*train, *held_out)}
-    shared = {sizes[path] for path in train} & {sizes[path] for path in held_out}
-    digest = {path: hashlib.sha256(path.read_bytes()).digest() for path, size in sizes.items() if size in shared}
-    return duplicates(*([digest.get(path) for path in paths] for paths in (train, held_out)))
-
-
-def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
-    """Pair held-out items with the first equal training item; None equals nothing."""
-    first: dict[Any, int] = {}
-    for i, content in enumerate(train):
-        first.setdefault(content, i)
-    return [(first[content], j) for j, content in enumerate(held_out) if content is not None and content in first]
-
-
-def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:
-    """Warn of held-out photographs that are trained on, unless all views serve for both."""
-    if not pairs or list(train) == list(held_out):
-        return
-    named = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
-    advice = "Figures on them say nothing about new views: remove the duplicates from the capture."
-    warn(f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. {advice}")

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.types import ColmapCamera, Photograph, fail, is_full_sphere, say, warn
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say, warn
 
 MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
 NODE_STEP = 4  # pixels between the nodes of the distortion; interpolating between them is far more exact than a pixel
@@ -339,3 +339,44 @@ def _field(camera: ColmapCamera) -> float:
     away = np.linalg.norm(pixels - (lens.principal_point_x, lens.principal_point_y), axis=-1)
     outwards = (np.diff(away, axis=0, prepend=0.0) > 0.0).all(1)
     return float(MAX_ANGLE if outwards.all() else angles[max(0, int(outwards.argmin()) - 1)])
+
+
+def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
+    """Convert nerfstudio's camera type, see `transforms.CAMERA_TYPES`, and its distortion_params to COLMAP's.
+
+    Args:
+        values: k1, k2, k3, k4, p1, p2; twelve of FISHEYE624.
+
+    Returns:
+        camera model with separate focal lengths, and its parameters after fx, fy, cx, cy (none if SPHERICAL_MODEL).
+
+    Raises:
+        CaptureError: COLMAP has no such camera.
+    """
+    if kind == "EQUIRECTANGULAR":
+        return SPHERICAL_MODEL, ()
+    if kind not in ("PERSPECTIVE", "FISHEYE", "FISHEYE624"):
+        fail(
+            f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
+            f"which are the kinds that can be trained on, but {kind}. Correct the capture."
+        )
+    counts, needs = {
+        "PERSPECTIVE": ((6,), "perspective cameras need six: k1, k2, k3, k4, p1, p2"),
+        "FISHEYE": ((4, 6), "fisheye cameras need four: k1, k2, k3, k4"),
+        "FISHEYE624": ((12,), "FISHEYE624 needs twelve"),
+    }[kind]
+    if len(values) not in counts:
+        fail(f"the camera {label} has {len(values)} distortion_params; {needs}. Correct the capture.")
+    if kind == "FISHEYE624":
+        return "RAD_TAN_THIN_PRISM_FISHEYE", tuple(values)
+    if kind == "FISHEYE":
+        return "OPENCV_FISHEYE", tuple(values[:4])
+    k1, k2, k3, k4, p1, p2 = values
+    if k4 != 0.0:
+        fail(
+            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras have k1 to k3, p1, p2 only. "
+            "For a fisheye write camera_model OPENCV_FISHEYE; else undistort first (COLMAP's image_undistorter)."
+        )
+    if k3 != 0.0:
+        return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
+    return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())

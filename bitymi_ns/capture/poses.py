@@ -28,7 +28,7 @@ from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera,
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.reading import read_json
+from bitymi_ns.safe_reading import read_json
 
 GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
 TELLING = 0.25  # least share of 360-degree pictures among photographs of a size for all of them to count as such

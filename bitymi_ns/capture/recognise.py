@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from bitymi_ns.capture import folder_contents
 from bitymi_ns.capture.types import fail
-from bitymi_ns.reading import MOST_TEXT, open_regular, open_text, read_json
+from bitymi_ns.safe_reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
 
 Format = Literal[

@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.capture.depth_normal_maps import MapFiles, maps_beside, maps_called
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.folder_contents import is_photograph
 from bitymi_ns.capture.image_files import image_size, in_proportion
-from bitymi_ns.capture.maps import MapFiles, maps_beside, maps_called
 from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
 from bitymi_ns.capture.transforms import MAX_SIDE
 from bitymi_ns.capture.types import OPENCV_AXES, ColmapCamera, Photograph, Pose, fail, parsing, warn
 from bitymi_ns.progress import rich_progress
-from bitymi_ns.reading import read_json, read_text
+from bitymi_ns.safe_reading import read_json, read_text
 from bitymi_ns.trust import listed
 
 

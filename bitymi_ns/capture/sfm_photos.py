@@ -21,7 +21,7 @@ from bitymi_ns.capture.image_files import eight_bits, in_srgb
 from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.types import CaptureError, is_full_sphere
 from bitymi_ns.progress import Progress
-from bitymi_ns.reading import open_regular, why
+from bitymi_ns.safe_reading import open_regular, why
 from bitymi_ns.trust import is_text
 
 PLAIN = {

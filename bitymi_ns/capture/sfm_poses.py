@@ -17,7 +17,7 @@ from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.sfm_photos import photo_folder
 from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
-from bitymi_ns.reading import read_json
+from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import Refused, leads_inside, listed
 
 MODEL = Path("sparse/0")

@@ -1,17 +1,18 @@
 """Split a capture into training and held-out photographs: by rule, or by names."""
 
+import hashlib
 import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from bitymi_ns.capture.find_files import find_named
-from bitymi_ns.capture.types import Photograph, fail, parsing
-from bitymi_ns.reading import read_text
+from bitymi_ns.capture.types import Photograph, fail, parsing, warn
+from bitymi_ns.safe_reading import read_text
 from bitymi_ns.trust import listed
 
 Mode = Literal["fraction", "filename", "interval", "all"]
@@ -138,3 +139,31 @@ def read_split_lists(folder: Path) -> NameLists:
             with parsing(path, "Write one name on each line, in UTF-8."):
                 lists[split] = [line.strip() for line in read_text(path).splitlines() if line.strip()]
     return lists
+
+
+Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
+
+
+def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:
+    """Pair files of the same bytes, reading only files of equal size."""
+    sizes = {path: path.stat().st_size for path in (*train, *held_out)}
+    shared = {sizes[path] for path in train} & {sizes[path] for path in held_out}
+    digest = {path: hashlib.sha256(path.read_bytes()).digest() for path, size in sizes.items() if size in shared}
+    return duplicates(*([digest.get(path) for path in paths] for paths in (train, held_out)))
+
+
+def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
+    """Pair held-out items with the first equal training item; None equals nothing."""
+    first: dict[Any, int] = {}
+    for i, content in enumerate(train):
+        first.setdefault(content, i)
+    return [(first[content], j) for j, content in enumerate(held_out) if content is not None and content in first]
+
+
+def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: Sequence[Path]) -> None:
+    """Warn of held-out photographs that are trained on, unless all views serve for both."""
+    if not pairs or list(train) == list(held_out):
+        return
+    named = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
+    advice = "Figures on them say nothing about new views: remove the duplicates from the capture."
+    warn(f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. {advice}")

@@ -6,7 +6,6 @@ top of the file. Unused entries are reported.
 
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any
@@ -23,12 +22,13 @@ from bitymi_ns.capture.find_files import (
     report_files,
 )
 from bitymi_ns.capture.image_files import image_size
+from bitymi_ns.capture.lens import colmap_distortion
 from bitymi_ns.capture.masks import with_masks
 from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
 from bitymi_ns.capture.recognise import SPLITS
 from bitymi_ns.capture.splits import NameLists
 from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say, warn
-from bitymi_ns.reading import read_json
+from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import listed
 
 HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
@@ -337,44 +337,3 @@ def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tupl
     else:
         values = [check_number(path, "distortion_params", each, label) for each in np.ravel(stated).tolist()]
     return colmap_distortion(kind, values, f"{label} in {path}")
-
-
-def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
-    """Convert nerfstudio's camera type, see CAMERA_TYPES, and its distortion_params to COLMAP's.
-
-    Args:
-        values: k1, k2, k3, k4, p1, p2; twelve of FISHEYE624.
-
-    Returns:
-        camera model with separate focal lengths, and its parameters after fx, fy, cx, cy (none if SPHERICAL_MODEL).
-
-    Raises:
-        CaptureError: COLMAP has no such camera.
-    """
-    if kind == "EQUIRECTANGULAR":
-        return SPHERICAL_MODEL, ()
-    if kind not in ("PERSPECTIVE", "FISHEYE", "FISHEYE624"):
-        fail(
-            f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
-            f"which are the kinds that can be trained on, but {kind}. Correct the capture."
-        )
-    counts, needs = {
-        "PERSPECTIVE": ((6,), "perspective cameras need six: k1, k2, k3, k4, p1, p2"),
-        "FISHEYE": ((4, 6), "fisheye cameras need four: k1, k2, k3, k4"),
-        "FISHEYE624": ((12,), "FISHEYE624 needs twelve"),
-    }[kind]
-    if len(values) not in counts:
-        fail(f"the camera {label} has {len(values)} distortion_params; {needs}. Correct the capture.")
-    if kind == "FISHEYE624":
-        return "RAD_TAN_THIN_PRISM_FISHEYE", tuple(values)
-    if kind == "FISHEYE":
-        return "OPENCV_FISHEYE", tuple(values[:4])
-    k1, k2, k3, k4, p1, p2 = values
-    if k4 != 0.0:
-        fail(
-            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras have k1 to k3, p1, p2 only. "
-            "For a fisheye write camera_model OPENCV_FISHEYE; else undistort first (COLMAP's image_undistorter)."
-        )
-    if k3 != 0.0:
-        return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
-    return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())

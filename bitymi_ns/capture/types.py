@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, NoReturn
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.reading import reading
+from bitymi_ns.safe_reading import reading
 
 if TYPE_CHECKING:
     import pycolmap

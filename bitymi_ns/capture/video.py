@@ -17,7 +17,7 @@ from bitymi_ns.capture.sfm_photos import sharpness
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, complete_folder
 from bitymi_ns.progress import Progress
-from bitymi_ns.reading import open_regular
+from bitymi_ns.safe_reading import open_regular
 
 SMALL = 160  # longer side of frames for measuring motion, pixels
 FINE = 640  # longer side of frames for measuring sharpness, pixels

@@ -38,7 +38,7 @@ def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, n
     image = torch.zeros(fine.height * fine.width, 3)
     if background is not None:
         image[:] = background
-    hits = nearest(quads, fine, near)
+    hits = nearest_hits(quads, fine, near)
     image[hits.pixel] = hits.color
     return averaged({"rgb": image.view(1, fine.height, fine.width, 3)}, SAMPLES)["rgb"][0]
 
@@ -54,7 +54,7 @@ class QuadHits:
 
 
 @torch.no_grad()
-def nearest(quads: Quads, camera: Camera, near: float) -> QuadHits:
+def nearest_hits(quads: Quads, camera: Camera, near: float) -> QuadHits:
     """Find the nearest quad at each pixel; see `draw_quads`."""
     K, viewmat = camera.K.double(), camera.viewmat.double()
     corners = quads.corners.double() @ viewmat[:3, :3].T + viewmat[:3, 3]  # [Q, 4, 3]

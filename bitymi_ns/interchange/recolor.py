@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.codec.pages import size_classes, texel_index
-from bitymi_ns.interchange.draw_quads import nearest
+from bitymi_ns.interchange.draw_quads import nearest_hits
 from bitymi_ns.interchange.quads import Quads
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
@@ -39,7 +39,7 @@ def recolored(
     flat = quads.pages.reshape(-1, 4).clone()
     for done, camera in enumerate(cameras, start=1):
         wanted = picture(camera).clamp(0.0, 1.0).reshape(-1, 3)
-        hits = nearest(quads, camera, near)
+        hits = nearest_hits(quads, camera, near)
         x, y = (hits.uv * torch.tensor([width, height])).long().unbind(1)
         at = (quads.page[hits.quad] * height + y) * width + x
         one = torch.ones(len(at), 1)

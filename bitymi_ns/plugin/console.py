@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.endings import INTERRUPTED as INTERRUPTED
+from bitymi_ns.exit_messages import INTERRUPTED as INTERRUPTED
 from bitymi_ns.trust import listed as listed
 from bitymi_ns.trust import printable
 

@@ -26,7 +26,7 @@ from rich.errors import MarkupError
 from rich.markup import escape
 from rich.panel import Panel
 
-from bitymi_ns import endings
+from bitymi_ns import exit_messages
 from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import CONFIG, bundle_at
 from bitymi_ns.files import check_writable, write_errors_as
@@ -164,7 +164,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     """
     model, evaluated = config.pipeline.model, _folder_being_evaluated()
     if evaluated is not None:
-        endings.install()
+        exit_messages.install()
         refuse_others()
         patch_viewer(config)
         patch_render()

@@ -15,7 +15,7 @@ from PIL import Image as PILImage
 from bitymi_ns.files import complete_folder
 from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import no_progress, rich_progress
-from bitymi_ns.reading import read_json
+from bitymi_ns.safe_reading import read_json
 from bitymi_ns.sample.room import Room, RoomHits
 from bitymi_ns.trust import check_replaceable
 

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
 from bitymi_ns.ops import Prefilter, TexelAlpha, project, surfel_coverage
+from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import Scene
+
+SAMPLE = 4096  # random surfels whose visibility is tested first: nearly all views see one of them
+CHUNK = 1 << 20  # surfels tested at a time after that
 
 
 @dataclass(frozen=True)
@@ -74,3 +82,32 @@ def visibility(
         squares[done - 1] = shown[:, 2]
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, pixels, squares)
+
+
+@torch.no_grad()
+def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
+    """List the indices of the views that no surfel is visible in.
+
+    A surfel counts as visible if its bounding sphere extends beyond the near plane and into the image.
+    """
+    means = scene.surfels["means"].detach()
+    radii = SUPPORT * scene.surfels["log_scales"].detach().exp().amax(-1)
+    first = torch.randperm(len(means), generator=torch.Generator().manual_seed(0))[:SAMPLE].to(means.device)
+    return [
+        i
+        for i, camera in enumerate(cameras)
+        if not _sees(camera, means[first], radii[first], scene.near)
+        and not any(
+            _sees(camera, *chunk, scene.near) for chunk in zip(means.split(CHUNK), radii.split(CHUNK), strict=True)
+        )
+    ]
+
+
+def _sees(camera: Camera, means: Tensor, radii: Tensor, near: float) -> bool:
+    camera = camera.to(means.device)
+    x, y, z, _ = camera.project(means, near)
+    seen = z > near - radii
+    for at, focal, size in ((x, camera.K[0, 0], camera.width), (y, camera.K[1, 1], camera.height)):
+        reach = focal * radii / z.clamp(min=near)
+        seen &= (at > -reach) & (at < size + reach)
+    return bool(seen.any())

@@ -8,10 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT
+from bitymi_ns.ops.constants import COLOR_BIAS
 from bitymi_ns.ops.view_kinds import entry_of
 from bitymi_ns.ranges import check_ranges
-from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import NEAR, Scene
@@ -25,8 +24,6 @@ MAX_SCALE = 0.25
 PIXELS_PER_FIRST_SURFEL = 1000  # minimum number of pixels rendered in a run per initial surfel
 FEWEST_FIRST = 5000  # lower bound of the limit on initial surfels, in runs of any length
 MIN_SCALE = 1e-6  # smallest initial scale, as a share of the scene extent
-SAMPLE = 4096  # random surfels whose visibility is tested first: nearly all views see one of them
-CHUNK = 1 << 20  # surfels tested at a time after that
 
 
 @dataclass
@@ -351,32 +348,3 @@ def default_table_size(image_pixels: int) -> int:
 def table_size_of(image_pixels: int) -> int:
     """Compute log2 of the entries per hash level that the photographs support: one (4 features) per 32 pixels."""
     return round(math.log2(max(1, image_pixels) / 32))
-
-
-@torch.no_grad()
-def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
-    """List the indices of the views that no surfel is visible in.
-
-    A surfel counts as visible if its bounding sphere extends beyond the near plane and into the image.
-    """
-    means = scene.surfels["means"].detach()
-    radii = SUPPORT * scene.surfels["log_scales"].detach().exp().amax(-1)
-    first = torch.randperm(len(means), generator=torch.Generator().manual_seed(0))[:SAMPLE].to(means.device)
-    return [
-        i
-        for i, camera in enumerate(cameras)
-        if not _sees(camera, means[first], radii[first], scene.near)
-        and not any(
-            _sees(camera, *chunk, scene.near) for chunk in zip(means.split(CHUNK), radii.split(CHUNK), strict=True)
-        )
-    ]
-
-
-def _sees(camera: Camera, means: Tensor, radii: Tensor, near: float) -> bool:
-    camera = camera.to(means.device)
-    x, y, z, _ = camera.project(means, near)
-    seen = z > near - radii
-    for at, focal, size in ((x, camera.K[0, 0], camera.width), (y, camera.K[1, 1], camera.height)):
-        reach = focal * radii / z.clamp(min=near)
-        seen &= (at > -reach) & (at < size + reach)
-    return bool(seen.any())

@@ -158,7 +158,7 @@ def downscale_mask(mask: Tensor, width: int, height: int) -> Tensor:
     return downscale_image(mask.float(), width, height) > 0.999
 
 
-def nearest(values: Tensor, width: int, height: int) -> Tensor:
+def resample_nearest(values: Tensor, width: int, height: int) -> Tensor:
     """Resample values [H, W, ...] to [height, width, ...] by nearest neighbour: depth must not average across edges."""
     rows, columns = (
         ((torch.arange(new, device=values.device) + 0.5) * (old / new)).long()
@@ -215,7 +215,9 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
             )
     size = (camera.width, camera.height)
     mask = None if view.mask is None else downscale_mask(view.mask.to(device), *size)
-    depth, normal = (None if each is None else nearest(each.to(device), *size) for each in (view.depth, view.normal))
+    depth, normal = (
+        None if each is None else resample_nearest(each.to(device), *size) for each in (view.depth, view.normal)
+    )
     return View(camera, downscale_image(image, *size), mask, view.correction, depth, normal)
 
 

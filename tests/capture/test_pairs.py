@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from bitymi_ns.capture.sfm import pairs
 from bitymi_ns.capture.sfm.explain import ViewGraph, left_out
 from bitymi_ns.capture.sfm.job import Job
-from bitymi_ns.capture.sfm.pairs import NEIGHBOURS, is_sequence, nearest, sequence
+from bitymi_ns.capture.sfm.pairs import NEIGHBOURS, is_sequence, nearest_neighbours, sequence
 
 
 def connected(count: int, found: set[tuple[int, int]]) -> bool:
@@ -20,7 +20,7 @@ def connected(count: int, found: set[tuple[int, int]]) -> bool:
 def test_chosen_pairs_leave_no_part_alone(count: int, most: int, seed: int) -> None:
     alike = np.random.default_rng(seed).integers(0, most + 1, (count, count)).astype(np.float32)
     alike = np.triu(alike, 1) + np.triu(alike, 1).T
-    pairs = nearest(alike, 3)
+    pairs = nearest_neighbours(alike, 3)
     assert connected(count, pairs)
     assert all(0 <= i < j < count for i, j in pairs)
     for i in range(count):  # the best neighbour is among them

@@ -13,8 +13,8 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import bin_cuda, capacity, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, workspace
-from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera
 from tests.ops.golden import (
     GOLDEN_NAMES,
@@ -60,7 +60,7 @@ def render(
     camera = camera_of(case, dtype)
     projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, prefilter=prefilter)
     fragments = ops.trace(projection, rim)
-    directions = reference_render.view_directions(leaves["means"], camera.viewmat.to(device))
+    directions = view_directions(leaves["means"], camera.viewmat.to(device))
     base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     image = ops.blended_image(fragments, projection, base, maps=maps)
     # directions by pixel and surfel, independent of the list's order

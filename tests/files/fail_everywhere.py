@@ -27,7 +27,7 @@ from nerfstudio.scripts import render
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.scripts.eval import ComputePSNR
 
-from bitymi_ns import cli, endings
+from bitymi_ns import cli, exit_messages
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.report import FILES
@@ -108,7 +108,7 @@ def said(write: Write) -> str | None:
         except SystemExit as error:
             line = str(error)
         except OSError as error:
-            line = endings.line_of(error) or ""
+            line = exit_messages.line_of(error) or ""
             if not line:
                 raise
     assert line.strip() and "Traceback" not in line and "[Errno" not in line, line

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns import files
-from bitymi_ns.reading import read_text
+from bitymi_ns.safe_reading import read_text
 
 WAITS = """
 import sys

@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from bitymi_ns.bundle import Bundle
-from bitymi_ns.interchange.draw_quads import _fetch, draw_quads, nearest
+from bitymi_ns.interchange.draw_quads import _fetch, draw_quads, nearest_hits
 from bitymi_ns.interchange.glb import quads_glb, upright
 from bitymi_ns.interchange.quads import Quads, quads_of
 from bitymi_ns.interchange.recolor import recolored
@@ -115,10 +115,10 @@ def test_quads_that_reach_behind_the_camera_are_drawn_in_front_of_it(camera) -> 
     floor = torch.tensor([[[-50.0, 1, -50], [50, 1, -50], [50, 1, 50], [-50, 1, 50]]])
     white = torch.full((1, 4, 4, 4), 255, dtype=torch.uint8)
     uv = torch.tensor([[[0.2, 0.2], [0.8, 0.2], [0.8, 0.8], [0.2, 0.8]]])
-    hits = nearest(Quads(floor, uv, torch.zeros(1).long(), white), camera(0.0, 64, 48), 0.1)
+    hits = nearest_hits(Quads(floor, uv, torch.zeros(1).long(), white), camera(0.0, 64, 48), 0.1)
     rows = torch.unique(hits.pixel // 64)
     assert rows.tolist() == list(range(25, 48)) and len(hits.pixel) == 23 * 64  # y = 1: row 24 + 50 / z, z < 50
-    assert len(nearest(Quads(floor[:0], uv[:0], hits.quad[:0], white), camera(0.0, 64, 48), 0.1).pixel) == 0
+    assert len(nearest_hits(Quads(floor[:0], uv[:0], hits.quad[:0], white), camera(0.0, 64, 48), 0.1).pixel) == 0
 
 
 def test_a_mesh_takes_the_colours_of_pictures_where_it_is_seen(camera) -> None:

@@ -11,6 +11,7 @@ from bitymi_ns.ops import backend
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import front, textured
@@ -156,7 +157,7 @@ def test_random_scenes_in_single_precision(seed: int) -> None:
     scene, camera = scene_of(case, torch.float32)
     output = scene.render(camera, case.background.float(), maps=True)
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
-    directions = reference_render.view_directions(leaves["means"], case.viewmat)
+    directions = view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in SURFEL_KEYS]
     want = reference_render.render(geometry, colors, case, case.background)

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.reference.project import project
-from bitymi_ns.ops.reference.render import Render, render, view_directions
-from bitymi_ns.ops.reference.view_color import sv
+from bitymi_ns.ops.reference.render import Render, render
+from bitymi_ns.ops.reference.view_color import sv, view_directions
 from tests.ops.golden import (
     GOLDEN_NAMES,
     SURFEL_KEYS,

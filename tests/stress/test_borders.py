@@ -12,6 +12,7 @@ from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, front_scene
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera, HashField, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 
@@ -79,7 +80,7 @@ def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend
     got = scene.render(camera).rgb.double().cpu()
     doubles = {key: value.double().cpu() for key, value in surfels.items()}
     colors = reference_view_color.sv(
-        *(doubles[key] for key in SV_KEYS), reference_render.view_directions(doubles["means"], case.viewmat)
+        *(doubles[key] for key in SV_KEYS), view_directions(doubles["means"], case.viewmat)
     )
     geometry = [doubles[key] for key in SURFEL_KEYS]
     want = reference_render.render(geometry, colors, replace(case, K=case.K.float().double()), tiles=patches)

@@ -3,12 +3,13 @@
 import pytest
 import torch
 
+from bitymi_ns.scene import visibility
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
-from bitymi_ns.train import init
+from bitymi_ns.scene.visibility import views_without_surfels
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.init import surfels_from_points, views_without_surfels
+from bitymi_ns.train.init import surfels_from_points
 
 
 def scene_at(points: torch.Tensor, scale: float = 0.01) -> Scene:
@@ -28,7 +29,7 @@ def camera(turned: bool = False) -> Camera:
 
 @pytest.mark.parametrize("sample", [1, 4096])
 def test_views_that_see_nothing_are_named(sample: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(init, "SAMPLE", sample)
+    monkeypatch.setattr(visibility, "SAMPLE", sample)
     points = torch.tensor([[0.0, 0.0, 2.0], [0.1, 0.0, 2.0], [50.0, 0.0, 2.0], [90.0, 0.0, 2.0]])
     assert views_without_surfels(scene_at(points), [camera(), camera(turned=True)]) == [1]
 

@@ -10,7 +10,7 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import LossConfig, TrainConfig
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.losses import depth_error, normal_error, objective
-from bitymi_ns.train.views import View, at_size, nearest
+from bitymi_ns.train.views import View, at_size, resample_nearest
 
 
 def a_plane(height: int = 7, width: int = 9) -> torch.Tensor:
@@ -87,7 +87,7 @@ def test_maps_are_resized_to_the_nearest(views) -> None:
     view = views[0]._replace(depth=depth, normal=depth[..., None].expand(48, 48, 3))
     small = at_size(view, view.camera.scaled(0.5), "cpu")
     assert torch.equal(small.depth, depth[1::2, 1::2]) and small.normal.shape == (24, 24, 3)
-    assert view.nbytes > views[0].nbytes and torch.equal(nearest(depth, 48, 48), depth)
+    assert view.nbytes > views[0].nbytes and torch.equal(resample_nearest(depth, 48, 48), depth)
     with pytest.raises(ValueError, match="the depth is 10 x 48"):
         at_size(view._replace(depth=depth[:, :10]), view.camera, "cpu")
 

@@ -46,14 +46,14 @@ def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int
     if job.matching == "exhaustive" or (job.matching == "auto" and count <= FEW):
         return list(combinations(range(count), 2))
     alike = likeness(job, database, tell)
-    pairs = nearest(alike, NEIGHBOURS)
+    pairs = nearest_neighbours(alike, NEIGHBOURS)
     if job.sequence or job.matching == "sequential" or is_sequence(alike):
         pairs |= sequence(count)
     placed = [i for i, name in enumerate(job.order) if name in job.positions]
     if len(placed) > NEIGHBOURS:
         places = np.array([job.positions[job.order[i]] for i in placed])
         close = -np.linalg.norm(places[:, None] - places[None], axis=-1)
-        pairs |= {(placed[i], placed[j]) for i, j in nearest(close - close.min() + 1.0, NEIGHBOURS)}
+        pairs |= {(placed[i], placed[j]) for i, j in nearest_neighbours(close - close.min() + 1.0, NEIGHBOURS)}
     return sorted(pairs)
 
 
@@ -88,7 +88,7 @@ def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
     return alike + alike.T
 
 
-def nearest(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
+def nearest_neighbours(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
     """Pair each photograph with those most alike, and along a tree of the best pairs, which connects all; `alike` [n,n]
     is symmetric, 0 = nothing shared."""
     pairs = set()

@@ -13,7 +13,7 @@ from typing import Any
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.measure.machine import commit, machine, versions
-from bitymi_ns.reading import read_bytes
+from bitymi_ns.safe_reading import read_bytes
 from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"

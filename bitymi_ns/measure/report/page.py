@@ -15,7 +15,7 @@ from bitymi_ns.measure.report.plots import Plot, draw_plots
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
 from bitymi_ns.measure.report.tables import NOTES, poses_tables, quality_tables, training_table
-from bitymi_ns.reading import open_regular
+from bitymi_ns.safe_reading import open_regular
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="bitymi report">'  # marks pages that may be replaced

@@ -16,7 +16,7 @@ from PIL import Image
 
 from bitymi_ns.measure.report.read import SIDE_BY_SIDE
 from bitymi_ns.measure.report.records import is_bundle_name
-from bitymi_ns.reading import open_regular
+from bitymi_ns.safe_reading import open_regular
 
 ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
 ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"

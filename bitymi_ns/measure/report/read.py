@@ -22,8 +22,8 @@ from bitymi_ns.measure.report.records import (
     link,
 )
 from bitymi_ns.measure.report.tables import COLUMNS
-from bitymi_ns.reading import read_text as text_of
-from bitymi_ns.reading import reading
+from bitymi_ns.safe_reading import read_text as text_of
+from bitymi_ns.safe_reading import reading
 from bitymi_ns.trust import finite_numbers, json_of
 
 PICTURES = "pictures.json"

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.project import CameraLike
-from bitymi_ns.ops.reference.project import project, unit
+from bitymi_ns.ops.reference.project import project
 from bitymi_ns.ops.reference.trace import SUPPORT, Trace, trace
 
 
@@ -51,11 +51,6 @@ def texel(tile: Tensor, uv: Tensor, of: Tensor | None = None) -> Tensor:
     top = tile[(*at, low[:, 1], low[:, 0])] * (1 - fu) + tile[(*at, low[:, 1], high[:, 0])] * fu
     bottom = tile[(*at, high[:, 1], low[:, 0])] * (1 - fu) + tile[(*at, high[:, 1], high[:, 0])] * fu
     return top * (1 - fv) + bottom * fv
-
-
-def view_directions(means: Tensor, viewmat: Tensor) -> Tensor:
-    """Compute unit vectors [N, 3] from the camera to the surfels' centres, world frame; differentiable in `means`."""
-    return unit(means + viewmat[:3, :3].T @ viewmat[:3, 3])
 
 
 def fetched(tiles: Sequence[Tensor], uv: Tensor, where: Tensor) -> Tensor:

@@ -132,3 +132,8 @@ def lean(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> 
         else:
             out.append({"sh": sh, "sb": sb, "sg": sg}[kind](color[None], own[None], d[None])[0])
     return torch.stack(out) if out else base
+
+
+def view_directions(means: Tensor, viewmat: Tensor) -> Tensor:
+    """Compute unit vectors [N, 3] from the camera to the surfels' centres, world frame; differentiable in `means`."""
+    return unit(means + viewmat[:3, :3].T @ viewmat[:3, 3])

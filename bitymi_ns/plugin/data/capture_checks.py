@@ -26,7 +26,7 @@ from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.views import MOVED
-from bitymi_ns.reading import read_json, why
+from bitymi_ns.safe_reading import read_json, why
 
 STOCK_FORMATS: dict[type[DataParserConfig], Format] = {
     NerfstudioDataParserConfig: "nerfstudio",

@@ -18,7 +18,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, Datapa
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from torch import Tensor
 
-from bitymi_ns.capture import image_files
+from bitymi_ns.capture import image_files, splits
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
@@ -154,8 +154,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         check_photographs_exist(self.get_datapath(), every)
         image_files.check_sizes(every)
         image_files.check_orientation(every)
-        self._duplicates = image_files.duplicate_files(*files)
-        image_files.warn_of_duplicates(self._duplicates, train, held_out)
+        self._duplicates = splits.duplicate_files(*files)
+        splits.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
             one = f"only one training view in {self.config.data}"
             fail(f"{one}. A scene cannot be learned from one image: take photographs from more sides.")
@@ -209,8 +209,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         reported = {j for _, j in self._duplicates}
         summaries = [[d.summary(i) for i in range(len(d))] for d in (train, held_out)]
         fingerprints = [[None if each.empty else each.fingerprint for each in some] for some in summaries]
-        pairs = [pair for pair in image_files.duplicates(*fingerprints) if pair[1] not in reported]
-        image_files.warn_of_duplicates(pairs, train.image_filenames, held_out.image_filenames)
+        pairs = [pair for pair in splits.duplicates(*fingerprints) if pair[1] not in reported]
+        splits.warn_of_duplicates(pairs, train.image_filenames, held_out.image_filenames)
 
     @cached_property
     def _budget(self) -> MemoryBudget:

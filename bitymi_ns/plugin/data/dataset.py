@@ -25,7 +25,7 @@ from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.plugin.data.depth import FITTED
 from bitymi_ns.plugin.data.views import MOVED, NO_PHOTOS, photograph_files, select_views
-from bitymi_ns.train.views import MemoryBudget, nearest, over_background
+from bitymi_ns.train.views import MemoryBudget, over_background, resample_nearest
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for all images of a capture where a step is on the CPU, and takes far longer than reading one."""
@@ -112,7 +112,7 @@ class BitymiDataset(InputDataset):
         if fitted := self._dataparser_outputs.metadata.get(FITTED):
             size = (data["image"].shape[1], data["image"].shape[0])
             maps = fitted[image_idx].read(self._lens(image_idx))
-            data |= {name: nearest(torch.from_numpy(values), *size).half() for name, values in maps.items()}
+            data |= {name: resample_nearest(torch.from_numpy(values), *size).half() for name, values in maps.items()}
         data.update(self.get_metadata(data))
         return data
 

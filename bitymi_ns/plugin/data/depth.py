@@ -12,9 +12,9 @@ import numpy.typing as npt
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
+from bitymi_ns.capture.depth_normal_maps import MAPS, Values, read_depth, read_normal
 from bitymi_ns.capture.image_files import in_threads, read_image
 from bitymi_ns.capture.lens import Lens, Pinhole
-from bitymi_ns.capture.maps import MAPS, Values, read_depth, read_normal
 from bitymi_ns.capture.points import GREY
 from bitymi_ns.capture.types import MapFiles
 from bitymi_ns.plugin.console import say, warn

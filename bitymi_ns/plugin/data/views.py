@@ -12,11 +12,10 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.lens import Lens, Pinhole, make_lenses
-from bitymi_ns.capture.maps import MAPS
+from bitymi_ns.capture.depth_normal_maps import MAPS
+from bitymi_ns.capture.lens import Lens, Pinhole, colmap_distortion, make_lenses
 from bitymi_ns.capture.pose_checks import check_spread, far_from_origin
 from bitymi_ns.capture.read import Capture
-from bitymi_ns.capture.transforms import colmap_distortion
 from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, FrameOptions, MapFiles, Photograph, Pose
 from bitymi_ns.plugin.console import fail, listed, say
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from bitymi_ns import endings
+from bitymi_ns import exit_messages
 from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
@@ -112,7 +112,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
     def main(self) -> None:
         """Run the export."""
-        endings.install()
+        exit_messages.install()
         earlier = None
         bake_options = self._options()
         try:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bitymi_ns import endings
+from bitymi_ns import exit_messages
 from bitymi_ns.bundle import BundleError, read_bundle
 from bitymi_ns.bundle.parts import CAMERAS, bundle_at
 from bitymi_ns.bundle.strict_json import plain
@@ -59,7 +59,7 @@ class ExportMesh(SurfaceOptions):
 
     def main(self) -> None:
         """Run the export."""
-        endings.install()
+        exit_messages.install()
         path = self.output_dir / f"{NAME}.{self.format}"
         try:
             check_ranges(self)

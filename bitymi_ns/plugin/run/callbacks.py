@@ -23,9 +23,10 @@ from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_cap
 from bitymi_ns.plugin.run.memory import state_training
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.visibility import views_without_surfels
 from bitymi_ns.train import messages
 from bitymi_ns.train.evaluate import evaluate
-from bitymi_ns.train.init import scene_extent, views_without_surfels
+from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
 from bitymi_ns.trust import json_of, no_links

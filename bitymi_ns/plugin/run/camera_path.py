@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.ranges import first_problem
-from bitymi_ns.reading import read_json, reading
+from bitymi_ns.safe_reading import read_json, reading
 
 MOST_PIXELS = 16_384  # along a side of a frame
 SLACK = 1e-3  # tolerance of R R^T = I

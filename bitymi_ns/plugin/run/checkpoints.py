@@ -11,7 +11,7 @@ import torch
 from bitymi_ns.files import complete_file, reason
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.run.checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check
-from bitymi_ns.reading import open_regular, reading
+from bitymi_ns.safe_reading import open_regular, reading
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.trust import json_of
 

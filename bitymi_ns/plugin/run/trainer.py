@@ -28,7 +28,7 @@ from bitymi_ns.plugin.hooks import filter_console, ignore_torch_warnings
 from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.plugin.run.model import BitymiModel
-from bitymi_ns.reading import reading
+from bitymi_ns.safe_reading import reading
 from bitymi_ns.train import optimizers
 from bitymi_ns.train.processes import ProcessesApart, ProcessLost
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import torch
 
+from bitymi_ns.capture.depth_normal_maps import MAPS, MapFiles, maps_beside, read_depth
 from bitymi_ns.capture.lens import lenses_of
-from bitymi_ns.capture.maps import MAPS, MapFiles, maps_beside, read_depth
 from bitymi_ns.capture.types import ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.sample.capture import RoomView, first_hits, generate

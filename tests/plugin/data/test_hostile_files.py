@@ -17,7 +17,7 @@ from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.measure.report.page import build
 from bitymi_ns.measure.report.records import ReportError
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.reading import open_regular
+from bitymi_ns.safe_reading import open_regular
 from tests.captures import edit_frames, expect, load_any
 from tests.formats import colmap, nerfstudio, polycam, scannet
 from tests.measure.report.conftest import cell, figures, write_lines

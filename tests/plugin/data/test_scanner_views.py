@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bitymi_ns.capture.maps import read_depth
+from bitymi_ns.capture.depth_normal_maps import read_depth
 from tests.captures import load_any, printed
 from tests.formats import SCANS, scanner_app, scannet, seven_scenes, stray_scanner
 

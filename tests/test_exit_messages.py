@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from bitymi_ns import endings
+from bitymi_ns import exit_messages
 from bitymi_ns.trust import python_command
 
 BITYMI = python_command("bitymi_ns.__main__", "main")
@@ -22,7 +22,7 @@ def test_a_reader_that_goes_away_is_no_error() -> None:
             assert process.stdout is not None and process.stderr is not None
             process.stdout.close()  # like `| head -c0`
             said = process.stderr.read().decode()
-        assert process.returncode == endings.NO_READER and said == ""
+        assert process.returncode == exit_messages.NO_READER and said == ""
 
 
 @pytest.mark.parametrize("after", [0.15, 0.6])
@@ -64,18 +64,18 @@ def test_ctrl_c_in_the_first_second(after: float) -> None:
 )
 def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
     """nerfstudio's commands catch nothing themselves."""
-    code = f"from bitymi_ns import endings; endings.install(); endings.install(); raise {error}"
+    code = f"from bitymi_ns import exit_messages; exit_messages.install(); exit_messages.install(); raise {error}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr.startswith(line) and done.stderr.count("\n") == 1
     assert done.returncode in (1, -signal.SIGINT)  # shells show 130
 
 
 def test_faults_of_the_program_keep_their_traceback() -> None:
-    code = "from bitymi_ns import endings; endings.install(); raise ZeroDivisionError"
+    code = "from bitymi_ns import exit_messages; exit_messages.install(); raise ZeroDivisionError"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "Traceback" in done.stderr and done.returncode == 1
     with pytest.raises(FileNotFoundError):
-        endings.run(lambda: len(Path("/nowhere").read_bytes()))
+        exit_messages.run(lambda: len(Path("/nowhere").read_bytes()))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")

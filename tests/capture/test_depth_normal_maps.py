@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bitymi_ns.capture.maps import read_array
+from bitymi_ns.capture.depth_normal_maps import read_array
 
 
 def test_headers_are_parsed_by_one_thread_at_a_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -20,7 +20,7 @@ from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.masks import in_proportion
 from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, parsing, warn
 from bitymi_ns.ranges import spread
-from bitymi_ns.reading import open_regular
+from bitymi_ns.safe_reading import open_regular
 
 MILLIMETER = 1e-3  # metres per unit of integer depth unless stated: nerfstudio's convention
 MAPS = "maps"  # metadata key of the views' `MapFiles`

@@ -284,7 +284,7 @@ def stack_cameras(cameras: Sequence[Camera], device: torch.device) -> tuple[Tens
 
 
 def frame(
-    scene: Any,  # of `compiled`
+    scene: Any,  # from `compiled`
     viewmats: Tensor,
     Ks: Tensor,
     background: Tensor | None,

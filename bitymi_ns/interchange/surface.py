@@ -94,8 +94,8 @@ def median_depth(
 
 
 def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
-    """Compute the box [2, 3] around the points of depth maps, without the outermost `QUANTILE` at each side, limited to
-    `REACH` times the extent of the cameras or their median depth.
+    """Compute the box [2, 3] around the points of depth maps, without the outermost `QUANTILE` at each side, within
+    `REACH` times the larger of the cameras' extent and the median depth.
 
     Raises:
         NoSurface: there are no cameras, or no pixel has a depth.

@@ -30,7 +30,7 @@ class SurfelColors:
 
 
 def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Select surfels by row; reduced view colours keep all terms, which they index."""
+    """Select surfels by row. The terms of lean view colours are all kept, as `view_span` indexes them."""
     return {name: value if name == "view_terms" else value[rows] for name, value in surfels.items()}
 
 
@@ -78,8 +78,8 @@ def weighted_fit(directions: Tensor, values: Tensor, weight: Tensor) -> Tensor:
 
 @torch.no_grad()
 def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
-    """Average the residual of each surfel over its texels, [N, 3], weighted by kernel times alpha; the constant of a
-    surfel without a tile. None: the scene has no residual."""
+    """Average the residual of each surfel over its texels, weighted by kernel times alpha: [N, 3]. Without a tile it is
+    the surfel's `mean_residual`. None: the scene has no residual."""
     if scene.mean_residual is None and scene.atlas is None:
         return None
     means = scene.surfels["means"]

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 FLAT = 1e-6  # height over longest side below which a triangle is degenerate, the precision of float32
 _ROUNDS = 20  # of collapsing degenerate triangles: each may create others
-_ATTEMPTS = 4  # at a closed mesh without degenerate triangles; it is closed after the first
+_ATTEMPTS = 4  # rounds of cleaning and closing; each leaves the mesh closed, but may leave degenerate triangles
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def _keys(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDAr
 
 
 def _joined(mesh: Triangles, to: npt.NDArray[np.int64]) -> Triangles:
-    """Replace each vertex by another [V]; remove degenerate and duplicate triangles, and pairs facing opposite ways."""
+    """Replace vertex i by `to[i]`, [V]; remove degenerate and duplicate triangles, and pairs facing opposite ways."""
     faces = to[mesh.faces]
     a, b, c = faces.T
     full = np.flatnonzero((a != b) & (b != c) & (c != a))

@@ -99,7 +99,7 @@ def _set_up_process() -> None:
 
 
 def give_back_memory() -> None:
-    """Release memory that is kept for later views to the system, before views of other sizes."""
+    """Return the memory that the CPU kernels keep for later views to the system, before views of other sizes."""
     if _set_up_process.cache_info().currsize:  # the CPU kernels have been asked for
         load("_cpu").give_back_memory()
 

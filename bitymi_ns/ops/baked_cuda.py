@@ -284,7 +284,7 @@ def stack_cameras(cameras: Sequence[CameraLike], device: torch.device) -> tuple[
 
 
 def frame(
-    scene: Any,  # of `compiled`
+    scene: Any,  # from `compiled`
     viewmats: Tensor,
     Ks: Tensor,
     background: Tensor | None,

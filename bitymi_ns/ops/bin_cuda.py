@@ -12,7 +12,7 @@ from .project import CameraLike, Projection
 
 @dataclass(frozen=True)
 class Bins:
-    """P potentially touching pairs of surfel and tile."""
+    """P pairs of a surfel and a screen tile that it may touch. Slots number them by surfel, front to back."""
 
     order: Tensor  # [N] int32 surfels front to back
     slot_start: Tensor  # [N + 1] int64 first slot of the surfel at each rank of that order
@@ -28,12 +28,12 @@ class Bins:
 
 
 def int32s(like: Tensor, *shape: int) -> Tensor:
-    """Allocate int32 numbers beside `like`."""
+    """Allocate int32 numbers on the device of `like`."""
     return torch.empty(shape, dtype=torch.int32, device=like.device)
 
 
 def int64s(like: Tensor, count: int) -> Tensor:
-    """Allocate int64 numbers beside `like`."""
+    """Allocate int64 numbers on the device of `like`."""
     return torch.empty(count, dtype=torch.int64, device=like.device)
 
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 def empty_list(geom: Tensor, count: int) -> dict[str, Tensor]:
-    """Allocate the numbers of `count` fragments by name."""
+    """Allocate weight, depth and sigma [count] and uv [2, count] of fragments, by name."""
     return {name: geom.new_empty(count) for name in ("weight", "depth", "sigma")} | {"uv": geom.new_empty(2, count)}
 
 
@@ -39,7 +39,7 @@ class Layout:
         self._ids: dict[str, Tensor] | None = None
 
     def ids(self) -> dict[str, Tensor]:
-        """surfel, pixel [F] int32."""
+        """Return surfel and pixel, [F] int32, by name."""
         if self._ids is None:
             with torch.inference_mode(False):  # cached, and may be used in a graph later
                 self._ids = self._find_ids()

@@ -18,7 +18,7 @@ Limit = tuple[float, ...]
 COLOR_LIMIT = 256.0  # of colours and of coefficients and lobes' colours, 1 = white
 SHAPE_LIMIT = 1e4  # of logits, angles and log sharpnesses: sigmoid and exp saturate far below
 DIRECTION_LIMIT = 1e6  # of unnormalised directions
-VECTOR_LIMIT = 2e7  # of differences of two temperatures, at most exp(16), times a direction
+VECTOR_LIMIT = 2e7  # of differences of two unit vectors, each times a temperature of at most exp(16)
 
 
 @dataclass(frozen=True)
@@ -52,12 +52,12 @@ class ViewColor:
     kept: str
     parameters: tuple[Parameter, ...]  # two or three, in the kernels' order; the second has one row per term
     counts: Collection[int]  # allowed numbers of terms
-    rule: str  # the same in words, for rows
+    rule: str  # the same in words, for messages, counting rows of the second parameter
     base_terms: int  # terms that the base of a lean colour replaces: 1, or 0 if it is additional
     option: str  # option of `SceneConfig` for the number of terms,
     terms_of: Callable[[int], int]  # and the number of terms for its value
-    # initial first parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator; they
-    # show the colours from every direction, or on average
+    # initial parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator; f_view is
+    # that colour in every direction, or on average
     start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]]
     lean_width: int  # numbers of a lean term
     lean_limit: Limit  # of a lean term, allowed in a bundle

@@ -18,7 +18,7 @@ from bitymi_ns.trust import printable
 
 @contextmanager
 def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar below other output in a terminal; yield a function of each finished step's index."""
+    """Show a progress bar below other output in a terminal; yield the function to call with a finished step's index."""
     columns = (TextColumn("step"), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())
     hidden = not CONSOLE.is_terminal
     with Progress(*columns, console=CONSOLE, refresh_per_second=2, transient=True, disable=hidden) as bar:
@@ -28,7 +28,7 @@ def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
 
 class InputError(SystemExit):
     """Wrong input. Python prints the message to stderr and exits with status 1. nerfstudio's commands handle no errors:
-    the traceback of an Exception through them would hide what the user can do."""
+    an Exception would end in a traceback, which hides what the user can do."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(f"bitymi: {message}"))
@@ -43,7 +43,7 @@ def fail(message: str, cause: BaseException | None = None) -> NoReturn:
 
 
 def say(message: str) -> None:
-    """Print one line, however long; brackets in it are no markup."""
+    """Print one line, however long; brackets in it are not markup."""
     CONSOLE.print(escape(printable(message)), soft_wrap=True)
 
 
@@ -62,7 +62,7 @@ def as_input_error() -> Iterator[None]:
 
 
 class _Console(logging.Handler):
-    """Prints reports on captures."""
+    """Log handler that prints reports on captures."""
 
     def emit(self, record: logging.LogRecord) -> None:
         (warn if record.levelno >= logging.WARNING else say)(record.getMessage())

@@ -52,7 +52,7 @@ REFUSED = {
 }
 """Classes of nerfstudio's scripts that cannot work on surfels, and remedies."""
 REMARKS = re.compile(
-    r"Saving config to|Saving checkpoints to"  # our summary of the run says where
+    r"Saving config to|Saving checkpoints to"  # the run's own summary says where
     r"|Mixed precision is disabled|Auto image downscale factor of 1$"
     r"|\[NOTE\] Not running eval iterations"  # the training curve is of held-out views
     r"|\[bold yellow\]Disabled comet|disabled local writer"
@@ -78,7 +78,7 @@ def allow_numpy_scalars() -> None:
 
 
 def read_names_of_callers() -> None:
-    """Have nerfstudio's list of methods to install read the names of its callers without their source files.
+    """Have nerfstudio's list of external methods read its callers' names without opening their source files.
 
     Changes: `inspect` in the list's namespace; it asks for the stack for each of its 26 entries. For: every ns-*
     command. Without: half of a command's start is spent there, 5 CPU seconds. Superfluous once nerfstudio asks for the
@@ -95,7 +95,7 @@ def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
     """Add commands to ns-export.
 
     Changes: `tyro` in the namespace of nerfstudio's script, which loads the plugin before it builds its commands'
-    union: `cli` gets the union with ours. For: ns-export. Without: `ns-export bitymi-atlas` and `bitymi-mesh` are
+    union: `cli` gets the union with these. For: ns-export. Without: `ns-export bitymi-atlas` and `bitymi-mesh` are
     unknown. Superfluous once nerfstudio has a registry of exports. Errors of `commands`, called with the first command
     line, leave nerfstudio's own commands working.
     """
@@ -192,7 +192,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
 
 
 def _callers(depth: int = 1) -> list[FrameType]:
-    """Return the frames from `depth` above the caller's outwards."""
+    """Return the frames of the call stack outwards, from that `depth` calls above this one; 1 = the caller's."""
     frame: FrameType | None = sys._getframe(depth)
     frames = []
     while frame is not None:
@@ -231,8 +231,8 @@ def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
 
 
 def _stub_checkpoint_dir(bundle: Path) -> Path:
-    """Make a temporary folder with an empty checkpoint, named after the bundle, in which no pickled data may lie; by
-    its path in results of ns-eval `bitymi report` tells a bundle."""
+    """Make a temporary folder with an empty checkpoint, as no pickled data may lie in a bundle. Its path has the name
+    of the bundle: by that path, in ns-eval's results, `bitymi report` recognises bundles."""
     scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
     atexit.register(shutil.rmtree, scratch, ignore_errors=True)
     folder = scratch / bundle.name / "nerfstudio_models"
@@ -268,7 +268,7 @@ def moved_capture(datamanager: Any) -> None:
 
 
 def patch_viewer(config: Any) -> None:
-    """Have ns-viewer, if it loads `config`, show this scene by our rules.
+    """Have ns-viewer, if it loads `config`, serve this machine alone, end at Ctrl-C, and do without photographs.
 
     Changes: `_start_viewer` in nerfstudio's script, for this scene. For: ns-viewer. Without: the viewer is open to the
     network, as its command line replaces the recorded host; Ctrl-C ends in a traceback; bundles of lost photographs
@@ -300,8 +300,8 @@ def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any
 
 
 def patch_render() -> None:
-    """Have ns-render or ns-eval, if about to load a scene of ours, write by our rules. Raises InputError: an option or
-    the camera path cannot be used.
+    """Have ns-render or ns-eval check their options before loading the scene, and write whole results by this package.
+    Raises InputError: an option or the camera path cannot be used.
 
     Changes: functions in the script's namespace that render and write, until it has rendered; ns-eval's output path.
     For: ns-render, ns-eval. Without: films need a program ffmpeg, spirals roll, principal points are ignored, options

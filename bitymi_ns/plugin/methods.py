@@ -14,7 +14,7 @@ from bitymi_ns import KernelsUnavailable
 
 @dataclass
 class UnavailableConfig(TrainerConfig):
-    """Stands in for a method that failed to load, and reports the reason when used."""
+    """Stand-in for a method that failed to load, which reports the reason when used."""
 
     reason: str = ""
 
@@ -55,7 +55,7 @@ def _install() -> None:
 
 
 def _exports() -> list[Any]:
-    """Commands of ns-export."""
+    """List the commands for ns-export."""
     import tyro
 
     from bitymi_ns.plugin.export.command import ExportAtlas

@@ -45,7 +45,7 @@ class Cells:
     def __init__(self, path: Path) -> None:
         """
         Raises:
-            BenchError: a line is no cell.
+            BenchError: a line is not a cell.
         """
         self.path = path
         self.refresh()

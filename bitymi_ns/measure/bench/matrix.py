@@ -188,7 +188,7 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
     `hull_pc.ply`, if any.
 
     Raises:
-        BenchError: a folder is no capture, two have the same name, or there is none.
+        BenchError: a folder is not a capture, two have the same name, or there is none.
     """
     if not folders:
         raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')

@@ -59,7 +59,7 @@ def open_image(path: Path) -> Image.Image:
     """Read an image as RGB, or as RGBA if it has transparency.
 
     Raises:
-        OSError: the file is no readable image.
+        OSError: the file is not a readable image.
     """
     open_regular(path).close()
     try:

@@ -39,7 +39,7 @@ METRICS = {
     "lpips_vgg": ("LPIPS (VGG)", False, 0.01),
 }
 """Metric -> title, True if higher is better, minimum span of its axis."""
-MIN_POINTS = 3  # minimum number of points of a plot: the tables show the same
+MIN_POINTS = 3  # minimum number of points of a plot; for fewer the tables suffice
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: di
 
 
 def _variant(row: Evaluation) -> str:
-    """Strip the method from a label: the atlas format, or another distinguishing suffix."""
+    """Strip the method from a label, which leaves the atlas format or another distinguishing suffix."""
     return (row.group or row.label).removeprefix(row.method).strip(", ()")
 
 

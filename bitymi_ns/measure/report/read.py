@@ -27,7 +27,7 @@ from bitymi_ns.safe_reading import reading
 from bitymi_ns.trust import finite_numbers, json_of
 
 PICTURES = "pictures.json"
-MAX_BYTES = 64 << 20  # larger files are no evaluation
+MAX_BYTES = 64 << 20  # larger files are not evaluations
 MAX_DEPTH = 8  # levels of folders that are searched
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
 """File name stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
@@ -44,7 +44,7 @@ def parse_json(text: str, where: str) -> Any:
     """Parse JSON (NaN and Infinity tokens allowed).
 
     Raises:
-        ReportError: it is no valid JSON; the message names the file.
+        ReportError: it is not valid JSON; the message names the file.
     """
     try:
         return json_of(text)
@@ -56,7 +56,7 @@ def read_text(path: Path) -> str:
     """Read a text file.
 
     Raises:
-        ReportError: it is too large, no text, or cannot be read.
+        ReportError: it is too large, not text, or cannot be read.
     """
     with reading(path, _refuse, "Write it again, or leave it out."):
         return text_of(path, MAX_BYTES)
@@ -106,7 +106,7 @@ def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
     """Read the worst views listed in a pictures.json, as in `Records`; empty if the file is something else.
 
     Raises:
-        ReportError: it is no valid JSON, or its views are malformed.
+        ReportError: it is not valid JSON, or its views are malformed.
     """
     data = parse_json(read_text(path), str(path))
     if not isinstance(data, dict) or "bitymi_pictures" not in data:

@@ -78,7 +78,7 @@ PROBES = 3  # random perturbations of the inputs for `Errors.input_*`
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one case, each the maximum over all elements, relative to the largest value of the image or parameter.
+    """Errors of one case, each the maximum over all elements, relative to the largest value of the image or gradient.
 
     A pixel is compared only if both renderers blend the same surfels there, in the same branch of the kernel, and fetch
     between the same texels. The gradients are those of a loss over these pixels. In the other, flipped pixels rounding
@@ -246,7 +246,7 @@ def _relative(got: Tensor, want: Tensor) -> float:
 
 
 def _order(error: float) -> float:
-    """Sort key of errors: NaN is the largest."""
+    """Return the sort key of an error: NaN is the largest."""
     return math.inf if math.isnan(error) else error
 
 

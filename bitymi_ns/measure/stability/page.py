@@ -91,9 +91,9 @@ class SceneErrors:
     """Errors measured on one scene."""
 
     label: str
-    single: Errors
-    double: Errors
-    trust: ExtendedErrors | None
+    single: Errors  # of the kernels in float32
+    double: Errors  # of the kernels in float64
+    trust: ExtendedErrors | None  # of the float64 reference; None: too large a scene, or not `PLAIN`
 
     @property
     def exact(self) -> float:

@@ -262,7 +262,7 @@ RIM = 1e-3  # bound of the kernel's derivative at the rim, `SceneConfig.rim`'s d
 TEXELS, ALPHAS = "texels", "texel_alpha"  # names of texels and their alphas among the parameters of a case
 TILE = (8, 4)  # sides of a tile of a case, texels along u and v
 ON_A_TEXEL = 1e-6
-"""Distance from a texel's centre, as a share of the tile, below which rounding decides the side of it."""
+"""Distance from a texel's centre, as a share of the tile's side, below which rounding decides the cell."""
 
 
 @dataclass(frozen=True)
@@ -310,8 +310,8 @@ def tile_images(texels: Tensor) -> list[Tensor]:
 
 
 def cells(uv: Tensor) -> Tensor:
-    """Index the cell between texel centres, [...] int64, that coordinates [..., 2] lie in, which decides the slope of
-    the fetch; -1 if rounding decides the cell."""
+    """Find the cell between texel centres that coordinates [..., 2] lie in: index [...] int64, or -1 if rounding
+    decides it. The slope of the bilinear fetch changes between cells."""
     size = torch.tensor(TILE, dtype=torch.float64, device=uv.device)
     at = (uv.detach().double().clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # -0.5 to size - 0.5
     column, row = (at.floor().long() + 1).unbind(-1)

@@ -33,7 +33,7 @@ def hash_index(corner: Tensor, table_size: int) -> Tensor:
 
 
 def encode(c: Tensor, table: Tensor, min_resolution: int = 256) -> Tensor:
-    """Interpolate trilinear features [M, L F] (level-major) at grid coordinates c [M, 3] in [0, 1].
+    """Interpolate features trilinearly at grid coordinates c [M, 3] in [0, 1]: [M, L F], level-major.
 
     Level l has resolution R_l = min_resolution 2^l; the position is c R_l, its cell the floor of that. All levels are
     hashed.

@@ -31,7 +31,7 @@ class Arrays:
     """Arrays that the shaders read."""
 
     surfels: npt.NDArray  # [N] of `SURFEL`
-    terms: npt.NDArray[np.float32]  # [.] terms of the view colours
+    terms: npt.NDArray[np.float32]  # terms of the view colours, flat
     kind: int  # a number of `KINDS`
     origin: npt.NDArray[np.float64]  # [3] subtracted from positions, for float32 resolution far from the world's origin
 

@@ -45,11 +45,11 @@ def programs() -> Programs:
 class _Target:
     """Render targets for images of one size."""
 
-    size: tuple[int, int]
-    sums: Any
-    before: Any
-    read: Any
-    row_bytes: int
+    size: tuple[int, int]  # width, height
+    sums: Any  # textures: the blended sums, and their copy from before a batch
+    before: Any  # bind group of that copy
+    read: Any  # buffer to read the sums back
+    row_bytes: int  # bytes per row of `read`
 
 
 class SceneOnDevice:

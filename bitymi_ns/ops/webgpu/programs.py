@@ -27,7 +27,7 @@ def source(program: str) -> str:
 class Programs:
     """Pipelines for a device."""
 
-    device: Any  # of `device.device`
+    device: Any  # from `device.device`
     format: str  # of the render target
 
     def _module(self, name: str) -> Any:
@@ -61,7 +61,7 @@ class Programs:
         wgpu = library()
         vertex, fragment = wgpu.ShaderStage.VERTEX, wgpu.ShaderStage.FRAGMENT
         make = self.device.create_bind_group_layout
-        # part of the texture's binding declaration
+        # the binding declares whether the target's format can be filtered
         filters = self.format != "rgba32float" or "float32-filterable" in self.device.features
         read = {"type": "read-only-storage"}
         atlas = {"sample_type": "float", "view_dimension": "2d-array"}

@@ -16,8 +16,8 @@ POSSIBLE_VIEW = (0.01, 178.0)  # view angles of accepted focal lengths, degrees
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
-    """Convert a camera of nerfstudio's, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to
-    world-to-camera in OpenCV axes, on its device unless stated. Raises InputError: it is no perspective camera, or has
+    """Convert one of nerfstudio's cameras, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to
+    world-to-camera in OpenCV axes, on `device` or its own. Raises InputError: it is not a perspective camera, or has
     distortion."""
     cameras = cameras.reshape((-1,))
     if cameras.shape[0] != 1:
@@ -49,7 +49,7 @@ def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> li
 
 
 def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
-    """Fail or warn at pinhole cameras of both splits that see nothing, or whose focal length and size do not fit."""
+    """Fail or warn if a pinhole camera of either split sees nothing, or its focal length does not fit its size."""
 
     def column(name: str) -> Tensor:
         return torch.cat([getattr(some, name).flatten() for some in cameras]).double()
@@ -83,8 +83,8 @@ def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
 
 
 def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
-    """Convert blended depth [H, W, 1], the sum of w z over camera z, and alpha [H, W, 1], the sum of w, to the expected
-    distance [H, W, 1] along each pixel's ray, nerfstudio's depth; empty pixels get the picture's largest."""
+    """Convert blended depth [H, W, 1], the sum of w z with z in the camera frame, and alpha [H, W, 1], the sum of w, to
+    nerfstudio's depth [H, W, 1], the expected distance along each pixel's ray; empty pixels get the largest one."""
     height, width = depth.shape[:2]
     x = (torch.arange(width, device=depth.device) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     y = (torch.arange(height, device=depth.device) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
@@ -94,7 +94,7 @@ def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
 
 
 def normal_image(normal: Tensor, camera: Camera) -> Tensor:
-    """Convert blended camera-frame normals [H, W, 3] to colors (n + 1) / 2 of the world normal; 0 without any."""
+    """Convert blended camera-frame normals [H, W, 3] to colors (n + 1) / 2 of the world normal; 0 in empty pixels."""
     length = normal.norm(dim=-1, keepdim=True)
     unit = normal / length.clamp(min=1e-6)
     # R^T n without a matrix product, which cuBLAS refuses to deterministic algorithms

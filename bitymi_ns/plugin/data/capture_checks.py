@@ -41,14 +41,14 @@ STOCK_IGNORED = ("_target", "depths_path", "max_2D_matches_per_3D_point",
 
 
 def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
-    """Translate nerfstudio's parsers to `bitymi-data`, which checks more, unless their format or an option lacks
-    there."""
+    """Translate one of nerfstudio's parsers to `bitymi-data`, which checks more, unless that lacks its format or an
+    option that is set."""
     format = STOCK_FORMATS.get(type(config))
     if format is None:
         return config
     ours = {each.name for each in fields(BitymiDataParserConfig)} - {"_target"}
     if format == "instant-ngp":
-        ours -= {"scale_factor", "scene_scale"}  # which multiply there
+        ours -= {"scale_factor", "scene_scale"}  # there scene_scale multiplies the positions
     options: dict[str, Any] = {}
     for each in fields(config):
         value = getattr(config, each.name)
@@ -64,9 +64,15 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 @as_input_error()
 def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains: bool = True) -> None:
-    """Check that there is a capture at the data manager's path; replace nerfstudio's parsers by `bitymi_parser`.
-    `read`: read views with poses, too, silently. `trains`: there is an option for the path. Raises InputError: there is
-    none."""
+    """Check that there is a capture at the data manager's path, and replace its parser by that of `bitymi_parser`.
+
+    Args:
+        read: also read the views, silently, if the capture comes with poses.
+        trains: the command has an option for the path, --data.
+
+    Raises:
+        InputError: there is none, or an option is out of range.
+    """
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():

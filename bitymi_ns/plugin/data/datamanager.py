@@ -101,7 +101,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         dataset.metadata |= {
             "alpha_color": None if color is None else torch.as_tensor(color).float(),
             "has_alpha": bool(files) and image_files.file_has_transparency(files[0]),
-            # for a run with a background; photographs may be missing without training
+            # decides the background `auto`; photographs may be missing unless a run trains
             "transparent": self._has_photos(test_mode)
             and any(
                 image_files.file_has_transparency(files[i]) and dataset.get_numpy_image(i).shape[-1] == 4
@@ -139,7 +139,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return list(range(len(self.train_dataset)))
 
     def _check_images(self, test_mode: str) -> None:
-        """Fail or warn at captures from which no scene can be learned, before time is spent."""
+        """Fail or warn if no scene can be learned from the capture, before time is spent."""
         if not self._has_photos(test_mode):
             return
         count, datasets = len(self.train_dataset), (self.train_dataset, self.eval_dataset)
@@ -195,7 +195,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return drop_blank_views(outputs, split) if self._has_photos(self.test_mode) else outputs
 
     def check_pictures(self) -> None:
-        """Fail or warn if photographs show nothing, or the same in both splits."""
+        """Fail or warn if training photographs show nothing; warn of held-out ones that equal them."""
         train, held_out = self.train_dataset, self.eval_dataset
         empty: dict[str, list[Path]] = {}
         for i, path in enumerate(train.image_filenames):
@@ -219,7 +219,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def _load_images(  # type: ignore[override]
         self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
     ) -> CachedImages:
-        """Cache a split in memory of the host; a run decides what is on a card (`DownscaledViews`)."""
+        """Cache a split in host memory; a run decides what is on the GPU (`DownscaledViews`)."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         with reporting_input_errors(self.config):
             return CachedImages(dataset, self.config.cache_images_type, self._budget, f"Reading the {split} images")
@@ -236,7 +236,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def eval_dataloader(self) -> SimpleNamespace:
-        """Serve ns-render spiral its first camera: of a held-out view, else of training."""
+        """Loader that gives `ns-render spiral` its first camera: a held-out view's, else a training view's."""
         cameras = (self.eval_dataset if len(self.eval_dataset) else self.train_dataset).cameras
         return SimpleNamespace(get_camera=lambda image_idx: (cameras[image_idx : image_idx + 1], {}))
 
@@ -253,7 +253,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def train_views(self) -> OnDemand[View]:
-        """Training views at full size, read on demand, with pictures in memory of the host."""
+        """Training views at full size, read on demand, with pictures in host memory."""
         return self._views(self.train_dataset, lambda i: self.cached_train[i])
 
     @property
@@ -262,8 +262,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return self._views(self.eval_dataset, lambda i: self.cached_eval[i])
 
     def move_cameras(self, motions: Tensor) -> Callable[[Camera], Camera] | None:
-        """Move the training views' cameras to where a run has refined them, by its motions [V, 6] of `Poses`; return
-        what carries other cameras along, or None if the motions are of other photographs."""
+        """Apply the pose corrections of a run, motions [V, 6] of `Poses`, to the training views' cameras; return the
+        function that carries other cameras along, or None if the motions are of other photographs."""
         cameras = self.train_dataset.cameras
         if len(motions) != len(cameras):
             return None
@@ -282,7 +282,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return [[exposure.at(file) for file in dataset.files] for dataset in (self.train_dataset, self.eval_dataset)]
 
     def corrected_eval_views(self, state: Mapping[str, Any] | None) -> OnDemand[View]:
-        """Held-out views with their corrections, by the state of a run's `Exposure`."""
+        """Return the held-out views with their colour corrections, by the state of a run's `Exposure`."""
         views, (_, found) = self.eval_views, self.corrections(state)
         return OnDemand(len(views), lambda i: views[i]._replace(correction=found[i]))
 

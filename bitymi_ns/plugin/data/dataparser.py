@@ -33,7 +33,8 @@ _want_points: ContextVar[bool] = ContextVar("want_points", default=False)
 
 @contextmanager
 def reading_points(wanted: bool) -> Iterator[None]:
-    """Read points of captures, if a scene that starts from them is `wanted`; evaluation and the viewer skip them."""
+    """Have captures read with their points if `wanted`, for a scene that starts from them; evaluation and the viewer
+    skip them."""
     token = _want_points.set(wanted)
     try:
         yield
@@ -43,23 +44,23 @@ def reading_points(wanted: bool) -> Iterator[None]:
 
 @dataclass
 class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
-    """Reads what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data set,
-    an export of Polycam, Record3D, 3D Scanner App, Stray Scanner or an RGB-D camera, photographs, or a video."""
+    """Parser of what --data holds: a transforms.json of nerfstudio or instant-ngp, a COLMAP project, a Blender data
+    set, an export of Polycam, Record3D, 3D Scanner App, Stray Scanner or an RGB-D camera, photographs, or a video."""
 
     _target: type = field(default_factory=lambda: BitymiDataParser)
     alpha_color: Literal["white", "black"] | None = "white"
     """Color behind the transparent pictures of a Blender data set; None = that of the method."""
     depth: DepthKind = "auto"
-    """Depth of the photographs: metric, or relative (scale and shift fitted to the points), as the points say (auto);
-    off = use neither depth nor normals."""
+    """Depth of the photographs: metric = one scale for all; relative = scale and shift of each, fitted to the points;
+    auto = the one that agrees with the points; off = use neither depth nor normals."""
     depth_unit_scale_factor: float | None = None
-    """Metres of a unit of depth; None = 0.001 for integers, 1 for floating-point numbers."""
+    """Metres per unit of depth; None = 0.001 for integers, 1 for floating-point numbers."""
     poses: tyro.conf.Suppress[Path | None] = None
     """Folder of the poses that a run was trained with; set where its data are read."""
 
     @as_input_error()
     def resolve_names(self) -> None:
-        """Replace the name of a file of names by its content, so that config.yml needs no other file."""
+        """Replace a file in `eval_names` by the names that it holds, so that config.yml needs no other file."""
         self.eval_names = splits.read_names(self.eval_names)
 
 

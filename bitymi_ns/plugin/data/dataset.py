@@ -28,14 +28,14 @@ from bitymi_ns.plugin.data.views import MOVED, NO_PHOTOS, photograph_files, sele
 from bitymi_ns.train.views import MemoryBudget, over_background, resample_nearest
 
 PHOTOGRAPH_BYTES = 1 << 28
-"""Memory for all images of a capture where a step is on the CPU, and takes far longer than reading one."""
+"""Memory for the images of a capture in a run on the CPU, where a step takes far longer than reading one."""
 PREFETCH = 4  # images that are read together at the start
 RECENT = 2  # last images beyond the budget that stay cached: a step asks for a view more than once
 POSE_STEP = 1e-4  # resolution of compared poses, in units of the scene
 
 
 class BitymiDataset(InputDataset):
-    """nerfstudio's dataset with images undistorted by lenses; the model composes transparent ones, [H, W, 4]."""
+    """nerfstudio's dataset with images undistorted by their `Lens`; the model composes transparent ones, [H, W, 4]."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
@@ -53,7 +53,7 @@ class BitymiDataset(InputDataset):
 
     @as_input_error()
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
-        """Read image [H, W, 3 or 4]."""
+        """Read an undistorted image [H, W, 3 or 4]."""
         path = self.files[image_idx]
         camera = self.cameras[image_idx].reshape(())
         declared = (int(camera.width), int(camera.height))
@@ -78,11 +78,11 @@ class BitymiDataset(InputDataset):
         return self._summaries[image_idx]
 
     def get_image_float32(self, image_idx: int) -> Tensor:
-        """Read image [H, W, 3 or 4] in [0, 1], alpha not composed."""
+        """Read an image [H, W, 3 or 4] in [0, 1], alpha not composed."""
         return torch.from_numpy(self.get_numpy_image(image_idx)).float() / 255.0
 
     def get_image_uint8(self, image_idx: int) -> Tensor:
-        """Read image [H, W, 3 or 4], alpha not composed."""
+        """Read an image [H, W, 3 or 4], alpha not composed."""
         return torch.from_numpy(self.get_numpy_image(image_idx))
 
     def __getitem__(self, image_idx: int) -> dict[str, Any]:
@@ -136,8 +136,8 @@ class BitymiDataset(InputDataset):
 
 
 def photograph_bytes(device: torch.device, processes: int = 1) -> int:
-    """Return the memory of the host for a capture's images in one of a run's processes; with cards half of what is
-    available: a step there takes less time than reading a photograph."""
+    """Return the bytes of host memory for a capture's images in each process of a run. On GPUs the processes share half
+    of what is available, as a step takes less time than reading a photograph."""
     if device.type == "cpu":
         return PHOTOGRAPH_BYTES
     return max(PHOTOGRAPH_BYTES, int(min(psutil.virtual_memory().available, memory_limit()) / (2 * processes)))

@@ -21,7 +21,8 @@ from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.train.views import spread
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
-"""metric = one scale for all maps; relative = scale and shift of each; auto = as the points say; off = unused."""
+"""metric = one scale for all maps; relative = scale and shift of each; auto = by agreement with the points; off =
+unused."""
 FITTED = "fitted maps"  # metadata key of the views' `FittedMaps`
 SIDE = 320  # longest side of compared maps, pixels
 TOLERANCE = 0.05  # relative difference of depths of one surface
@@ -164,8 +165,8 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
-    """Fit each map to points [N, 3]; with too few, take it as metric, `unit` units per metre. None = depth is
-    unused."""
+    """Fit each map to points [N, 3]; with too few, take it as metric, with `unit` scene units per metre. None = depth
+    is unused."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None

@@ -98,7 +98,7 @@ def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose,
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
-    # not the poses: for `pca`, nerfstudio 1.1.5 turns upside-down cameras, but two of them only
+    # the returned poses are not used: for `pca`, nerfstudio 1.1.5 turns an upside-down scene, but two cameras only
     _, oriented = auto_orient_and_center_poses(
         torch.from_numpy(local.astype(np.float32)), frame.orientation_method, frame.center_method
     )
@@ -134,7 +134,7 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
 
 def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
-    """Give outputs of any nerfstudio parser lenses, and the lenses' pinhole cameras."""
+    """Add lenses to the outputs of any nerfstudio parser, with the lenses' pinholes as cameras."""
     if "lenses" in outputs.metadata or NO_PHOTOS in outputs.metadata:
         return outputs
     cameras = outputs.cameras
@@ -159,8 +159,8 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
-    """Downscale views of more than `longest` pixels along a side (0 = any) by their lenses. Raises InputError: it is
-    negative."""
+    """Downscale views of more than `longest` pixels along a side (0 = no limit), in their lenses. Raises InputError:
+    `longest` is negative."""
     if longest < 0:
         how = "give a number of pixels, or 0 to use photographs as they are"
         fail(f"--pipeline.datamanager.longest-side is {longest}: {how}.")

@@ -47,7 +47,7 @@ class CompactOptions:
     bundle that reaches it. Held-out views reach less."""
 
     def check_compact(self, form: BundleFormat) -> None:
-        """Stop at options out of range, or for another format."""
+        """Stop if an option is out of range, or for another format."""
         compact = form == "compact"
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if not compact and getattr(self, name) != getattr(CompactOptions, name):
@@ -68,7 +68,7 @@ class CompactOptions:
             say(f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: {more}")
 
     def compact_of(self, beside: int) -> Compact:
-        """Make options of the compact bake; `beside`: bytes of other files, such as the preview."""
+        """Build the options of the compact bake; `beside`: bytes of the bundle's other files, such as the preview."""
         compact = Compact(self.compact_error, psnr=self.target_psnr)
         try:
             return compact if self.target_mb is None else compact.fitting(self.target_mb, beside)
@@ -88,8 +88,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
     output_dir: Path  # Folder of the bundle.
     overwrite: bool = False  # Replace an existing bundle.
     exact: bool = False
-    """Keep everything: tiles at the Nyquist rate of the field, not capped by views, unseen surfels, all sites of view
-    colours, and the field's texels without fine-tuning."""
+    """Keep everything: tiles at the Nyquist rate of the field, not capped by the training views; unseen surfels; all
+    sites of view colours; and texels as trained or sampled from the field, without fine-tuning."""
     polish_steps: int | None = None
     """Steps in which texels, geometry, opacities and view colours learn together from the training photographs, without
     the network, before tiles and view colours are reduced; 0 = surfels stay as trained. Not given: 0 if texels learned
@@ -132,7 +132,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             fail(str(error), error)
 
     def _options(self) -> BakeOptions:
-        """Make options of the bake; stop at one out of range, before loading anything."""
+        """Build the options of the bake; stop if one is out of range, before anything is loaded."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
@@ -212,7 +212,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
 
 def main() -> None:
-    """Command line of this module."""
+    """Run the command line of this module."""
     tyro.cli(tyro.conf.FlagConversionOff[ExportAtlas]).main()
 
 

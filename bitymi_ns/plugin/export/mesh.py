@@ -41,7 +41,7 @@ class MeshScene(NamedTuple):
     cameras: Sequence[Camera]  # of the training views
     near: float  # nearest drawn depth, camera z
     prefilter: Prefilter  # as in `ops.project`
-    world: WorldEntry  # of the scene in the capture
+    world: WorldEntry  # transform from the capture's frame to the scene's
     alpha: TexelAlpha | None  # opacities of the texels; None = opaque
 
 
@@ -51,7 +51,7 @@ class ExportMesh(SurfaceOptions):
 
     load_config: Path  # config.yml of a trained scene or of a bundle, or a bundle in one file.
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
-    format: MeshFormat = "ply"  # Of the file. Those of other formats stay.
+    format: MeshFormat = "ply"  # Format of the file; files of other formats stay.
     frame: Frame = "capture"
     """Frame of the vertices: the capture's, with its unit of length, or the scene's, in which nerfstudio trains."""
     crop: bool = False  # Leave out the surfels that the bundle's notes.json hides.

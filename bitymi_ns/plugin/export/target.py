@@ -46,8 +46,8 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
 
 
 def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
-    """Estimate the most bytes of a run's bundle by its newest checkpoint; 0 without one. It counts as surfels alone,
-    each with a tile of TYPICAL_SIDE texels, or the largest tile if `exact`."""
+    """Estimate the most bytes of a run's bundle by the size of its newest checkpoint; 0 without one. The checkpoint is
+    taken to hold surfels alone, each with a tile of TYPICAL_SIDE texels per side, or the largest tile if `exact`."""
     newest = max(load_config.parent.glob("*/step-*.ckpt"), default=None)
     surfels = newest.stat().st_size // (3 * SURFEL_BYTES) if newest is not None else 0
     side = options.r_max if exact else min(options.r_max, TYPICAL_SIDE)
@@ -65,8 +65,8 @@ def bundle_version(folder: Path) -> tuple[int, int] | None:
 
 
 def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> bytes:
-    """Make the config.yml with which nerfstudio's tools open a bundle; bundle.json does not vouch for it, as its data
-    path may have to be edited for moved photographs."""
+    """Make the config.yml with which nerfstudio's tools open a bundle. bundle.json does not cover it, as its data path
+    may have to be edited for moved photographs."""
     config = copy.deepcopy(config)
     config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=tuple(background))  # type: ignore[arg-type]
     config.load_dir = config.load_step = config.load_checkpoint = config.load_config = None

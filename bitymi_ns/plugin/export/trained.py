@@ -59,7 +59,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
 
 
 def world_of(datamanager: Any) -> World:
-    """Return the transform from scene to capture, with up and metres if our SfM found the poses."""
+    """Return the transform from the capture to the scene, with up and metres if this package's SfM found the poses."""
     outputs = datamanager.train_dataparser_outputs
     report = getattr(datamanager.dataparser, "poses_report", None)
     frame = None if report is None else read_frame(report)
@@ -74,8 +74,8 @@ def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
 
 
 def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool, exposure: Any) -> dict[str, bytes]:
-    """Make cameras.json, with corrections by the state of the run's `Exposure` (None: none), and if `photographs` the
-    held-out ones as JPEG of at most `MOST_PIXELS` along a side."""
+    """Make cameras.json, with colour corrections by the state of the run's `Exposure` (None: none), and, if asked for,
+    the held-out photographs as JPEG of at most `MOST_PIXELS` along a side: contents by name of the file."""
     files: dict[str, bytes] = {}
     names = [path.name for path in datamanager.train_dataset.image_filenames]
     trained, held_out = datamanager.corrections(exposure)

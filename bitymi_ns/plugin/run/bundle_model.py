@@ -38,14 +38,14 @@ class BakedModelConfig(SurfelModelConfig):
     bundle: Path = Path()  # Folder of the bundle when written; a moved one is found beside its config.yml.
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Colour behind the scene.
     renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
-    """kernels: on CUDA or the CPU; fast: the same, but pixels end at less than half an 8-bit step of light; webgpu: on
-    graphics of any maker, by the package wgpu."""
+    """kernels: on CUDA or the CPU; fast: the same, but a pixel ends when what follows adds less than half an 8-bit
+    step; webgpu: on GPUs of any vendor, by the package wgpu."""
     crop: bool = False
     """Leave out the surfels that the bundle's notes.json hides."""
 
 
 class BakedModel(SurfelModel):
-    """Renders a bundle's files alone: no network, no checkpoint."""
+    """Model that renders a bundle's files alone: no network, no checkpoint."""
 
     config: BakedModelConfig
 

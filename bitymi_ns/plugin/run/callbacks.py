@@ -33,7 +33,7 @@ from bitymi_ns.trust import json_of, no_links
 
 
 class TrainingRun:
-    """Ties `Training` to nerfstudio's loop. Order of a step there:
+    """Link between `Training` and nerfstudio's loop. Order of a step there:
 
     `before` -> the data manager's `next_train` -> `losses` -> backward -> `Training.combine` -> optimisers -> `after`.
     """
@@ -111,7 +111,7 @@ class TrainingRun:
         ]
 
     def state(self) -> dict[str, Any]:
-        """Return all but parameters and optimisers that decides how the run goes on."""
+        """Return the state, beside parameters and optimisers, that decides how a resumed run goes on."""
         return {**self.training.state_dict(), "random": torch.get_rng_state(), "capture": self.capture}
 
     def before(self, step: int) -> None:
@@ -190,7 +190,7 @@ FILE = "training_curve.jsonl"
 
 
 class TrainingCurve:
-    """Appends points to a run's file; a resumed run keeps those up to its checkpoint."""
+    """File of a run to which points are appended; a resumed run keeps those up to its checkpoint."""
 
     def __init__(self, path: Path, resumed_from: Path | None = None, steps_done: int = 0) -> None:
         self.path = path
@@ -208,7 +208,7 @@ class TrainingCurve:
         try:
             with open(self.path, "ab", buffering=0, opener=no_links) as file:
                 line, kept = f"{json.dumps(point)}\n".encode(), file.tell()
-                if file.write(line) < len(line):  # no point may follow half a one
+                if file.write(line) < len(line):  # no point may follow half of one
                     file.truncate(kept)
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         except OSError as error:

@@ -1,5 +1,5 @@
 """Check a checkpoint's entries, the optimisers' included: names, kinds, shapes and types. Compiled code trusts sizes,
-so nothing else sees them before."""
+so nothing else uses an entry before."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bitymi_ns.trust import json_of
 EXTRA_STATE = "_extra_state"  # torch's name of a module's state beside tensors
 SCENE = "_model.scene."  # prefix of the scene's parameters
 SURFELS = f"{SCENE}surfels."
-LARGEST = 1e15  # absolute value of a drawable parameter: its square and sums of these are float32
+LARGEST = 1e15  # absolute value of a drawable parameter: its square, and sums of squares, are finite in float32
 _GEOMETRY = dict(zip(GEOMETRY, ((3,), (4,), (2,), (), ()), strict=True))
 
 
@@ -84,7 +84,8 @@ class Entry:
         return int(self.number(low, MOST))
 
     def tensor(self, *shape: int | None, dtype: torch.dtype | None = torch.float32) -> Tensor:
-        """Return contiguous numbers of this shape, None = any size: strides in files may declare more than there is."""
+        """Return a contiguous CPU tensor of this shape, None = any size; with dtype None, of any shape and dtype. A
+        file's strides may reach beyond its numbers."""
         value = self.value
         plain = type(value) in (Tensor, Parameter) and value.layout == torch.strided and value.device.type == "cpu"
         fits = plain and dtype in (None, value.dtype) and value.is_contiguous()
@@ -110,9 +111,9 @@ def _kind(value: Any) -> str:
 
 
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
-    """Check all entries of a checkpoint of a scene of this kind, without dispensable ones of other versions; return
-    names of those with numbers that are not finite, or too large to be drawn. Raises Misfit: an entry is missing or
-    wrong."""
+    """Check all entries of a checkpoint against the configuration of its scene; those that other versions lack may be
+    missing. Return the names of parameters with numbers that are not finite, or too large to be drawn. Raises Misfit:
+    an entry is missing or wrong."""
     root = Entry(dict(state))
     root["step"].count()
     pipeline = root["pipeline"]

@@ -43,7 +43,7 @@ class BitymiTrainerConfig(TrainerConfig):
     ] = "viewer"  # fmt: skip
     """Visualizer; none = no viewer, and no log but the training curve."""
     max_num_iterations: int | None = None
-    """Length of the run in steps; schedules scale. Not given: --default-iterations; a resumed run: as before."""
+    """Length of the run in steps; schedules scale with it. Not given: --default-iterations, or as before if resumed."""
     default_iterations: int = 30_000  # Steps of a run on a GPU when --max-num-iterations is not given.
     default_iterations_cpu: int = 3_000
     """Steps of a run without a supported GPU when --max-num-iterations is not given."""
@@ -71,8 +71,8 @@ class BitymiTrainerConfig(TrainerConfig):
             fail(f"a run is of one capture, and two are given: {named}. Leave out one of them.")
 
     def set_timestamp(self) -> None:
-        """Set timestamp, seeds, device and absolute paths before nerfstudio writes config.yml. Start a run's several
-        processes, and exit with them; all but the first copy the first one's settings."""
+        """Set timestamp, seeds, device and absolute paths before nerfstudio writes config.yml. If a run has several
+        processes, start them and exit with them; in these, all but the first copy the first one's settings."""
         if not torchrun.own().first:
             torchrun.join(self)
             return
@@ -149,7 +149,7 @@ class BitymiTrainerConfig(TrainerConfig):
         return "\n".join(f"{name:8} {value}" for name, value in lines.items())
 
     def resolve_length(self, trained_for: int | None = None) -> None:
-        """Set run length and save interval if not given; `trained_for`: resumed length."""
+        """Set run length and save interval if not given; `trained_for`: length of the resumed run."""
         if self.max_num_iterations is None:
             default = self.default_iterations_cpu if self.machine.device_type == "cpu" else self.default_iterations
             self.max_num_iterations = trained_for or default

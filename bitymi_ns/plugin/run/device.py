@@ -33,7 +33,7 @@ def why_not_cuda(index: int | None = None) -> str | None:
 
 @cache
 def _device_problem(kernels: ModuleType, index: int) -> str | None:
-    """Have the kernels try that GPU."""
+    """Have the kernels try a GPU; return why they cannot run on it, or None."""
     return kernels.device_problem(index) or None
 
 

@@ -26,7 +26,7 @@ ENDINGS = {"jpeg": ".jpg", "png": ".png"}
 FRAME = re.compile(r"\d{5}\.(jpg|png)")
 
 Add = Callable[[np.ndarray], None]
-"""Receives the next frame: [H, W, 3], or [H, W, 4] where the format has transparency, uint8."""
+"""Function that receives the next frame: [H, W, 3], or [H, W, 4] where the format has transparency, uint8."""
 
 
 @contextmanager
@@ -82,7 +82,7 @@ def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
 
 
 def check_frames(folder: Path) -> None:
-    """Stop at a folder with files other than frames, which would be lost."""
+    """Stop if a folder holds other files than frames, which would be lost."""
     if folder.is_dir() and not all(FRAME.fullmatch(path.name) for path in folder.iterdir()):
         fail(f"the folder {folder} holds other files than frames and is not replaced: choose another --output-path.")
 

@@ -46,8 +46,8 @@ class LpipsUnavailable(RuntimeError):
 
 def lpips(image: Tensor, reference: Tensor, backbone: str) -> float:
     """Measure LPIPS of two images [H, W, 3] float in [0, 1], of `LEAST_SIDE` pixels or more along each side, averaged
-    over pixels. Backbone "alex" is AlexNet fed with [-1, 1], as LPIPS' package, nerfstudio and gsplat state it; "vgg"
-    is VGG16 fed with [0, 1], as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable: the weights
+    over pixels. Backbone "alex" is AlexNet fed with [-1, 1], as the package lpips, nerfstudio and gsplat do; "vgg" is
+    VGG16 fed with [0, 1], as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable: the weights
     are missing and cannot be fetched."""
     weights = _on_device(backbone, str(image.device))
     pair = torch.stack([image, reference]).permute(0, 3, 1, 2).float()
@@ -157,7 +157,7 @@ def store(package: Path) -> None:
 
 
 class ArraysOnly(pickle.Unpickler):
-    """Reads pickles of NumPy arrays in dictionaries alone."""
+    """Unpickler of NumPy arrays in dictionaries alone."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("numpy.core.multiarray", "_reconstruct"):

@@ -25,16 +25,16 @@ from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget, spread
 
 COUNTED_VIEWS = 3  # views with counted fragments
-MARGIN = 1.1  # factor of other views' fragments
+MARGIN = 1.1  # factor by which other views may have more fragments
 PROGRAM = 800e6  # bytes of Python, libraries, and a capture's cameras and points
 PER_FRAGMENT = 36  # bytes: list, gradients of weights and coordinates, order of the backward pass
 PER_SHADED_FRAGMENT = 60
-"""Bytes more of a field in space: surfels and pixels of fragments, points, residuals and their gradients."""
+"""Further bytes with a hash-grid field: surfels and pixels of fragments, points, residuals and their gradients."""
 PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes on a card in lists of training
-PER_PASSING_FRAGMENT = 36  # bytes on a card in passing lists, of texels' coverage: pictures need none
+PER_PASSING_FRAGMENT = 36  # bytes on a card in temporary lists, for the coverage of texels; pictures need no list
 PER_BAKED_FRAGMENT = 48
-"""Bytes on a card in an export, of the fine-tuning: 28 of the list, 1 + 36 of its chosen part, measured as at most 43
-%, and 3 of pairs, with about thirty each."""
+"""Bytes on a card in the fine-tuning of an export: 28 of the list, 1 + 36 of the part that shows texels, at most 43 %
+as measured, and 3 of the pairs of surfel and tile, with about thirty fragments each."""
 PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of multi-view scores
 PER_SURFEL = 3000  # bytes in training: parameters, gradients, Adam's averages, and two states to go back to
 PER_TEXEL = 28  # bytes in training: texel, its motion, and two states in half precision to go back to
@@ -68,9 +68,17 @@ def state_training(
     processes: int = 1,
     lists: bool = False,
 ) -> None:
-    """Print the memory estimate of a training run from its first scene and the cameras of its views, on the CPU: with
-    at most `most_surfels` (0 = any number), `texels` that learn from `to_come` views with repetition (None = none), in
-    `processes` of equal need on this machine; `lists`: losses need lists of fragments on a card, too."""
+    """Print the memory estimate of a training run.
+
+    Args:
+        scene: at the start.
+        cameras: of the training views, on the CPU.
+        most_surfels: largest number of surfels; 0 = no limit.
+        texels: options of texels that learn in training; None = none learn.
+        to_come: number of renders from which texels learn.
+        processes: of equal need on this machine.
+        lists: losses need lists of fragments on a card, too.
+    """
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
     card = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
@@ -99,9 +107,14 @@ def state_training(
 def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
-    """Print the memory estimate of an export from its scene and the cameras of its training views, on the CPU: with
-    `finetune_bytes` of views in the fine-tuning (0 = there is none), and `learning` surfels after the bake; `compact`:
-    view colours have the terms that pictures pay for."""
+    """Print the memory estimate of an export.
+
+    Args:
+        cameras: of the training views, on the CPU.
+        finetune_bytes: for the views that the fine-tuning keeps; 0 = no fine-tuning.
+        learning: number of surfels that learn in the polish; 0 = no polish.
+        compact: the bundle is compact, so that terms of view colours are chosen by rate-distortion.
+    """
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     fragments = most_fragments(scene, cameras)
@@ -122,7 +135,7 @@ def state_export(
 
 
 def _per_fragment(scene: Scene, of_card: float) -> float:
-    """Return the bytes of a fragment, on a card `of_card` unless a field in space shades."""
+    """Return the bytes per fragment; on a card `of_card`, or those of a list if a hash-grid field shades."""
     if scene.surfels["means"].device.type == "cuda":
         return PER_CARD_FRAGMENT if scene.config.texture == "hash" else of_card
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")

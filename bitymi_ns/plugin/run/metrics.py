@@ -22,7 +22,7 @@ def image_metrics(
     """Measure psnr, ssim, flip (if its package is installed), lpips and lpips_vgg (if their weights can be had) of
     images [H, W, 3] in [0, 1]; fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image; and
     mean_exposure_psnr and so on of the image without correction, if one is given. Pixels that a mask [H, W, 1] excludes
-    are equal in all for every metric and left out of PSNR and fit."""
+    are 0 in all images, and left out of PSNR and fit."""
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)

@@ -51,8 +51,8 @@ class BitymiModelConfig(SurfelModelConfig):
 
 
 def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
-    """Return training options with the colour that the capture states for transparent images, if any: as `alpha_color`,
-    and for a `background` of one colour, or auto without transparent images."""
+    """Return training options with the colour that the capture states for transparent images, if any, as `alpha_color`
+    and in place of a `background` of black or white. Without transparent images, auto becomes `alpha_color`."""
     color = config.alpha_color
     if alpha_color is not None:
         names: dict[float, Literal["black", "white"]] = {0.0: "black", 1.0: "white"}
@@ -89,7 +89,7 @@ class BitymiModel(SurfelModel):
 
     @property
     def background(self) -> Tensor:
-        """[3]: see `eval_background`."""
+        """Colour [3] behind the scene, see `eval_background`."""
         color = eval_background(self.train_config, self.device)
         return torch.zeros(3, device=self.device) if color is None else color
 
@@ -126,8 +126,8 @@ class BitymiModel(SurfelModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Judge a held-out view; after a run that refined poses also with its pose carried along with theirs, and from
-        where it fits the scene."""
+        """Measure a held-out view; after a run that refined poses, also with its pose carried along with those of the
+        training views (carried_psnr), and aligned to the scene (refined_psnr)."""
         metrics, images = super().get_image_metrics_and_images(outputs, batch)
         camera = getattr(self, "_last_camera", None)
         if self.carry is not None and camera is not None:

@@ -30,7 +30,7 @@ def take(folder: Path) -> None:
 
 
 def check_unused(folder: Path, checkpoints: Path) -> None:
-    """Stop a new run that would mix with checkpoints of an earlier one, and replace them in time."""
+    """Stop a new run whose checkpoints would mix with those of an earlier one, and in time replace them."""
     there = sorted(checkpoints.glob("step-*.ckpt"))
     if there:
         fail(
@@ -65,7 +65,7 @@ def keep_poses_report(folder: Path, report: Path | None, source: Source | None =
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Stop before the first step if a checkpoint of these bytes has no room."""
+    """Stop before the first step if there is no room for a checkpoint of `needed` bytes."""
     free = files.free_bytes(folder)
     if free < needed:
         fail(

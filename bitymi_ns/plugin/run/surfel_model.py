@@ -32,7 +32,7 @@ OVERDRAW_SCALE = 64.0
 
 @dataclass
 class SurfelModelConfig(ModelConfig):
-    """Base of options; nerfstudio's of models of rays, without meaning here, are left out of the help."""
+    """Base of model options. Options of nerfstudio for models of rays have no meaning here and are hidden in --help."""
 
     enable_collider: tyro.conf.Suppress[bool] = False
     collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
@@ -47,7 +47,7 @@ def box_of(box: OrientedBox | None) -> Box | None:
 
 
 class SurfelModel(Model):
-    """Renders whole images from surfels."""
+    """Model that renders whole images from surfels."""
 
     measure_time = True  # include render_ms in the image metrics; off in training
     crop_box: Box | None = None  # hides the surfels whose centres lie outside
@@ -147,7 +147,7 @@ class SurfelModel(Model):
         return metrics, {"img": torch.cat([target, rgb], dim=1)}
 
     def _exposed(self, camera: Camera) -> Tensor:
-        """Draw a camera [H, W, 3] with the correction of its photograph; with none, if it is not of the capture."""
+        """Draw a view [H, W, 3] with the colour correction of its photograph, or none if it has no photograph."""
 
         def apart(other: Camera) -> float:
             return float((other.viewmat.cpu() - camera.viewmat.cpu()).abs().max())

@@ -40,6 +40,7 @@ from bitymi_ns.files import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
 from bitymi_ns.measure.machine import commit
 from bitymi_ns.plugin.run.metrics import lpips_metrics
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene import Scene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import RenderOutput
@@ -49,7 +50,7 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.preset import Loader, Preset, load_preset
-from bitymi_ns.train.views import View, eval_background, spread
+from bitymi_ns.train.views import View, eval_background
 
 RUNS = ("10000/4", "1500/2", "300/1")
 WATCHED, EVERY, WATCH = 8, 30, 300

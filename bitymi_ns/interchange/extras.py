@@ -24,11 +24,12 @@ from bitymi_ns.interchange.splat import draw_gaussians
 from bitymi_ns.interchange.surfel_colors import SurfelColors, fit_colors, weighted_residuals
 from bitymi_ns.interchange.usd import check_usd, write_usd
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.train.losses import mean_psnr, psnr
-from bitymi_ns.train.views import View, at_size, spread
+from bitymi_ns.train.views import View, at_size
 from bitymi_ns.trust import check_replaceable
 
 Kind = Literal["gaussians", "surfels", "usd", "mesh"]

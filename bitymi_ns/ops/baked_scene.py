@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from .backend import Pool, version_of
-from .project import CameraLike, Prefilter
+from .project import CameraLike, Prefilter, refuse_skew
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "rgb": (3, torch.float32),
@@ -122,8 +122,8 @@ def common_size(cameras: Sequence[CameraLike]) -> tuple[int, int]:
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) != 1:
         raise ValueError(f"views that are drawn together need one size, not {sorted(sizes)}")
-    if any(camera.skewed for camera in cameras):
-        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+    for camera in cameras:
+        refuse_skew(camera)
     return sizes.pop()
 
 

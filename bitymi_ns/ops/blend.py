@@ -8,7 +8,7 @@ from torch import Tensor
 from .backend import check_shapes, cuda_backend, dense, kernel, module, on_same_device
 from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
-from .texel import TexelDescent, TexelTiles, gradient_or_step
+from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
 from .trace import Fragments
 
 
@@ -76,6 +76,7 @@ def checked_texels(
     tiles: TexelTiles | None,
     move_surfels: bool,
     descent: TexelDescent | None,
+    alpha: TexelAlpha | None = None,
 ) -> tuple[Tensor, TexelTiles, bool, TexelDescent | None]:
     """Check and complete the texel arguments of `blended_image`: texels [T, 3], tiles, move_surfels, descent.
 
@@ -84,6 +85,7 @@ def checked_texels(
         surfels: N.
         base: [N, 3] view colours.
         texels, tiles, move_surfels, descent: as in `blended_image`.
+        alpha: alphas that the view was projected with.
 
     Raises:
         ValueError: as `blended_image`.
@@ -101,6 +103,8 @@ def checked_texels(
         raise ValueError(f"the fragments are those of {surfels} surfels, not of {len(base)}")
     if descent is not None and (texels.requires_grad or not texels.is_contiguous()):
         raise ValueError("texels that the backward pass moves are dense and ask for no gradient")
+    if alpha is not None and alpha.tiles.first is not tiles.first:
+        raise ValueError("the alphas of texels lie in other tiles than their colours")
     return texels, tiles, move_surfels, descent
 
 

@@ -182,6 +182,12 @@ def rigid_gradient(means: Tensor, quats: Tensor, dmeans: Tensor, dquats: Tensor,
     return gradient.to(viewmat)
 
 
+def refuse_skew(camera: CameraLike) -> None:
+    """Raise ValueError for a camera whose K[0, 1] is not 0."""
+    if camera.skewed:
+        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+
+
 def checked_geometry(
     means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, beta_raw: Tensor, camera: CameraLike
 ) -> tuple[Tensor, ...]:
@@ -195,8 +201,7 @@ def checked_geometry(
     shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
     check_shapes(**shapes)
     on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
-    if camera.skewed:
-        raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+    refuse_skew(camera)
     return means, quats, log_scales, opacity_logits, beta_raw
 
 

@@ -144,12 +144,12 @@ def rasterize_image(
     """
     geom = projection.geom
     require("rasterize_image", "cuda", geom.device, "call `trace` and `blended_image`")
-    texels, tiles, move_surfels, descent = checked_texels(geom, len(geom), base, texels, tiles, move_surfels, descent)
+    texels, tiles, move_surfels, descent = checked_texels(
+        geom, len(geom), base, texels, tiles, move_surfels, descent, projection.alpha
+    )
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, even if nothing else learns
     alpha = None if projection.alpha is None else projection.alpha.values
-    if projection.alpha is not None and projection.alpha.tiles.first is not tiles.first:
-        raise ValueError("the alphas of texels lie in other tiles than their colours")
     image, layout = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
     seen = replace(projection, geom=geom.detach(), frames=projection.frames.detach())
     return image, Marks(seen, rim, layout)

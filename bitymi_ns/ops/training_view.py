@@ -181,9 +181,9 @@ def training_view(
     means = geometry[0]
     check_view_color(kind, surfels, len(means))
     photograph.check(means, (camera.height, camera.width))
-    texels, tiles, moves, descent = checked_texels(means, len(means), means, texels, tiles, move_surfels, descent)
-    if alpha is not None and alpha.tiles.first is not tiles.first:
-        raise ValueError("the alphas of texels lie in other tiles than their colours")
+    texels, tiles, moves, descent = checked_texels(
+        means, len(means), means, texels, tiles, move_surfels, descent, alpha
+    )
     surfel_inputs = (*geometry, *entry_of(kind).of(surfels))
     if descent is not None and not means.requires_grad:
         surfel_inputs = (means.detach().requires_grad_(), *surfel_inputs[1:])  # see `rasterize_image`

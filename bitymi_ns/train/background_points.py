@@ -10,8 +10,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask, spread
+from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask
 
 CELLS = 24  # maximum number of cells along the longer side of a photograph
 POINTS_PER_CELL = 4  # minimum average of points per cell: with fewer, cells may be empty by chance

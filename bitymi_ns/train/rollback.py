@@ -31,12 +31,13 @@ import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.optimizers import replace_rows
 from bitymi_ns.train.strategy import Strategy, finite_rows
-from bitymi_ns.train.views import DownscaledViews, spread, step_background
+from bitymi_ns.train.views import DownscaledViews, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene

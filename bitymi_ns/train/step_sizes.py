@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.views import spread
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene

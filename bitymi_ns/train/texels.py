@@ -16,6 +16,7 @@ from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.ops import TexelDescent, add_texel_coverage, project
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
@@ -23,7 +24,7 @@ from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.init import tangents
 from bitymi_ns.train.losses import count_values
 from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import OnDemand, at_size, spread
+from bitymi_ns.train.views import OnDemand, at_size
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene

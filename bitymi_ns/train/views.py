@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from bitymi_ns.ranges import spread as spread
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
 

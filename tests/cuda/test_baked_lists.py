@@ -10,7 +10,7 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.cuda.baked_scenes import FLIP, camera_of, front, listed_pairs, most, scene_of
-from tests.ops.golden import SURFEL_KEYS, crossing_scene, random_scene, reference, tiles_reached
+from tests.ops.golden import GEOMETRY, crossing_scene, random_scene, reference, tiles_reached
 
 
 def mask_pixels(renderer: BakedRenderer, surfels: int, width: int, height: int) -> int:
@@ -75,7 +75,7 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
     with cpu():
         want = scene.render(camera, maps=True).overdraw
     assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
-    weights = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    weights = reference(case, [case.params[name] for name in GEOMETRY]).weight
     assert renderer.workspace.pairs <= 1.25 * int(tiles_reached(weights, width, height).sum())
     assert mask_pixels(renderer, 60, width, height) <= 1.25 * float(want.sum())
 

@@ -7,7 +7,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.scene import Camera, HashField
-from tests.ops.golden import SURFEL_KEYS, random_scene
+from tests.ops.golden import GEOMETRY, random_scene
 from tests.ops.test_kernels import make_field, relative
 
 
@@ -68,7 +68,7 @@ class Shading:
         case = self.case
         camera = Camera(case.viewmat.to(self.dtype), case.K.to(self.dtype), case.width, case.height)
         with torch.no_grad():
-            projection = ops.project(*(case.params[key].to(device, self.dtype) for key in SURFEL_KEYS), camera)
+            projection = ops.project(*(case.params[key].to(device, self.dtype) for key in GEOMETRY), camera)
             fragments = ops.trace(projection)
         leaves = [t.to(device).clone().requires_grad_() for t in (self.base, projection.frames)]
         fragments.uv.requires_grad_()

@@ -11,7 +11,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
 from tests.cuda.test_trace import by_pixel_and_surfel
-from tests.ops.golden import SURFEL_KEYS, SceneCase, camera_of, random_scene, relative
+from tests.ops.golden import GEOMETRY, SceneCase, camera_of, random_scene, relative
 
 CpuContext = Callable[[], AbstractContextManager[None]]
 
@@ -48,9 +48,9 @@ def cut_scene(seed: int, count: int = 60, width: int = 50, height: int = 40, ext
 
 def traced(cut: Cut, dtype: torch.dtype, device: torch.device, seen: str = "weight uv depth") -> tuple:
     """Trace the fragments and compute gradients by name of a sum over the fields in `seen`."""
-    leaves = {key: cut.case.params[key].to(device, dtype).clone().requires_grad_() for key in SURFEL_KEYS}
+    leaves = {key: cut.case.params[key].to(device, dtype).clone().requires_grad_() for key in GEOMETRY}
     leaves["alpha"] = cut.alpha.to(device, dtype).clone().requires_grad_()
-    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera_of(cut.case, dtype), prefilter=cut.prefilter)
+    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera_of(cut.case, dtype), prefilter=cut.prefilter)
     tiles = ops.TexelTiles.of_sizes(cut.size.to(device), cut.extent.to(device, dtype))
     fragments = ops.trace(replace(projection, alpha=ops.TexelAlpha(tiles, leaves["alpha"], cut.bound)), 1e-3)
     direction = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
@@ -99,7 +99,7 @@ def test_alphas_of_one_change_nothing(device: torch.device) -> None:
     fragments, gradients = traced(cut, torch.float32, device)
     plain, expected = traced(replace(cut, size=torch.zeros_like(cut.size), alpha=cut.alpha[:0]), torch.float32, device)
     assert torch.equal(fragments.weight, plain.weight) and torch.equal(fragments.sigma, plain.sigma)
-    for key in SURFEL_KEYS:  # slopes along u and v are 0, and v differs in its mark
+    for key in GEOMETRY:  # slopes along u and v are 0, and v differs in its mark
         assert relative(gradients[key], expected[key]) < 1e-5, key
 
 

@@ -17,8 +17,8 @@ from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera
 from tests.ops.golden import (
+    GEOMETRY,
     GOLDEN_NAMES,
-    SURFEL_KEYS,
     SV_KEYS,
     SceneCase,
     camera_of,
@@ -58,7 +58,7 @@ def render(
     """Render a view, and its gradients along fixed directions for the image and for uv and depth of fragments."""
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = camera_of(case, dtype)
-    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, prefilter=prefilter)
+    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, prefilter=prefilter)
     fragments = ops.trace(projection, rim)
     directions = view_directions(leaves["means"], camera.viewmat.to(device))
     base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
@@ -165,7 +165,7 @@ def test_no_fragment_of_thin_small_and_large_surfels_is_lost(
     case.params["log_scales"] += 2.0 * torch.randn(100, 2, generator=g, dtype=torch.float64)
     case.params["opacity_logits"] -= 2.0  # so that few pixels end before the last surfel
     fragments = ops.trace(ops.project(*values_of(case, dtype, device), camera_of(case, dtype)))
-    want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    want = reference(case, [case.params[name] for name in GEOMETRY]).weight
     found = torch.zeros_like(want)
     found[fragments.pixel.cpu().long(), fragments.surfel.cpu().long()] = fragments.weight.detach().cpu().double()
     assert (want > 0).sum() > 1000

@@ -13,7 +13,7 @@ from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_sur
 from bitymi_ns.ops import TexelAlpha, TexelTiles
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
-from tests.ops.golden import GOLDEN_NAMES, SURFEL_KEYS, camera_of, load_golden, reference
+from tests.ops.golden import GEOMETRY, GOLDEN_NAMES, camera_of, load_golden, reference
 
 
 def plane(side: int, opacity: float = 0.95) -> dict[str, torch.Tensor]:
@@ -40,8 +40,8 @@ def looking_down(x: float, y: float, distance: float = 2.0) -> Camera:
 @pytest.mark.parametrize("name", GOLDEN_NAMES)
 def test_median_depth_is_that_of_the_reference(name: str) -> None:
     case = load_golden(name)
-    values = [case.params[key].double() for key in SURFEL_KEYS]
-    depth = median_depth(dict(zip(SURFEL_KEYS, values, strict=True)), camera_of(case), 0.2)
+    values = [case.params[key].double() for key in GEOMETRY]
+    depth = median_depth(dict(zip(GEOMETRY, values, strict=True)), camera_of(case), 0.2)
     t = reference(case, values)
     reached = t.weight[:, t.order].cumsum(1) >= 0.5
     z = t.depth[:, t.order].gather(1, reached.double().argmax(1, keepdim=True))[:, 0]

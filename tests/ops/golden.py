@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import (
-    SURFEL_KEYS,
+    GEOMETRY,
     SV_KEYS,
     SceneCase,
     extreme_scenes,
@@ -26,7 +26,7 @@ from bitymi_ns.scene import Camera
 
 __all__ = [
     "GOLDEN_NAMES",
-    "SURFEL_KEYS",
+    "GEOMETRY",
     "SV_KEYS",
     "Golden",
     "SceneCase",
@@ -120,8 +120,8 @@ def camera_of(case: SceneCase, dtype: torch.dtype = torch.float64) -> Camera:
 def values_of(
     case: SceneCase, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu", grad: bool = False
 ) -> list[Tensor]:
-    """Return the values of SURFEL_KEYS; grad: as new leaves."""
-    values = [case.params[key].to(device, dtype) for key in SURFEL_KEYS]
+    """Return the values of GEOMETRY; grad: as new leaves."""
+    values = [case.params[key].to(device, dtype) for key in GEOMETRY]
     return [value.clone().requires_grad_() for value in values] if grad else values
 
 
@@ -135,13 +135,13 @@ def relative(a: Tensor, b: Tensor) -> float:
 def traced(
     case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass"
 ) -> tuple[ops.Fragments, ops.Projection]:
-    """Trace the fragments of a case; values: those of SURFEL_KEYS."""
+    """Trace the fragments of a case; values: those of GEOMETRY."""
     projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=prefilter)
     return ops.trace(projection, 0.0), projection
 
 
 def reference(case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass") -> reference_trace.Trace:
-    """Evaluate every surfel at every pixel of a case; values: those of SURFEL_KEYS."""
+    """Evaluate every surfel at every pixel of a case; values: those of GEOMETRY."""
     projected = reference_project.project(*values, case.viewmat, case.K)
     return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)
 

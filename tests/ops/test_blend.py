@@ -9,7 +9,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
 from tests.ops.golden import (
-    SURFEL_KEYS,
+    GEOMETRY,
     SceneCase,
     camera_of,
     composite_colors,
@@ -40,7 +40,7 @@ class View:
             return (torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low).to(device, dtype)
 
         self.camera = camera_of(case, dtype)
-        self.leaves = [case.params[key].to(device, dtype).clone().requires_grad_() for key in SURFEL_KEYS]
+        self.leaves = [case.params[key].to(device, dtype).clone().requires_grad_() for key in GEOMETRY]
         self.base = uniform(-0.9, 0.5, n, 3).requires_grad_()
         self.leaves.append(self.base)
         self.given: dict[str, Tensor | ops.TexelTiles] = {}
@@ -53,7 +53,7 @@ class View:
                 self.leaves.append(texels)
 
     def fragments(self) -> tuple[ops.Fragments, ops.Projection]:
-        projection = ops.project(*self.leaves[: len(SURFEL_KEYS)], self.camera)
+        projection = ops.project(*self.leaves[: len(GEOMETRY)], self.camera)
         return ops.trace(projection), projection
 
     def image(self, maps: bool = False, moves: bool = True, descent: ops.TexelDescent | None = None) -> Tensor:
@@ -125,7 +125,7 @@ def test_the_golden_image_and_the_gradients_of_its_texels() -> None:
     tiles = ops.TexelTiles.of_sizes(sizes, torch.full((len(sizes),), 3.0, dtype=torch.float64))
     texels = torch.cat([tile.reshape(-1, 3) for tile in golden.tiles]).requires_grad_()
     camera = camera_of(golden)
-    projection = ops.project(*(golden.params[key] for key in SURFEL_KEYS), camera)
+    projection = ops.project(*(golden.params[key] for key in GEOMETRY), camera)
     base = ops.view_color("sv", golden.params, golden.params["means"], camera.center)
     image = ops.blended_image(ops.trace(projection), projection, base, texels, tiles)
     rgb = image[:, :3].view_as(golden.outputs["rgb"])

@@ -8,7 +8,7 @@ from bitymi_ns.ops import trace_cpu
 from bitymi_ns.ops.backend import function, kernel_class, module
 from bitymi_ns.ops.constants import TILE
 from bitymi_ns.ops.fragment_list import empty_ids, empty_list
-from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene
+from tests.ops.golden import GEOMETRY, camera_of, random_scene
 
 
 def blocks_of(projection: ops.Projection) -> dict[str, torch.Tensor]:
@@ -31,7 +31,7 @@ def test_blocks_have_the_surfels_and_pixels_of_the_fragments(
     case = random_scene(surfels, seed, width=width, height=height)
     camera = camera_of(case, dtype)
     case.params["log_scales"][::3, 0] -= 3  # long and thin
-    projection = ops.project(*(case.params[key].to(dtype) for key in SURFEL_KEYS), camera)
+    projection = ops.project(*(case.params[key].to(dtype) for key in GEOMETRY), camera)
     found = blocks_of(projection)
     across = -(-width // TILE)
     surfel, pixel, blocks_before = [], [], set()
@@ -66,7 +66,7 @@ def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPat
     made = []
     monkeypatch.setattr(trace_cpu, "empty_ids", lambda *given: made.append(given) or empty_ids(*given))
     case = random_scene(80, 1, width=64, height=48)
-    surfels = [case.params[key].clone().requires_grad_() for key in SURFEL_KEYS]
+    surfels = [case.params[key].clone().requires_grad_() for key in GEOMETRY]
     projection = ops.project(*surfels, camera_of(case, torch.float64))
     fragments = ops.trace(projection)
     ops.blended_image(fragments, projection, torch.full((80, 3), 0.3).double(), maps=True).sum().backward()

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from bitymi_ns.measure.stability.scenes import quaternions
 from bitymi_ns.ops import backend
 from tests.ops.golden import (
-    SURFEL_KEYS,
+    GEOMETRY,
     crossing_scene,
     dense,
     far_floor,
@@ -42,7 +42,7 @@ def test_every_fragment_of_the_brute_force_is_found(
     p["log_scales"] = torch.tensor([[scale, scale - ratio]], dtype=torch.float64)
     p["opacity_logits"] = torch.tensor([opacity], dtype=torch.float64)
     p["beta_raw"] = torch.tensor([beta], dtype=torch.float64)
-    values = [p[name] for name in SURFEL_KEYS]
+    values = [p[name] for name in GEOMETRY]
     fragments, _ = traced(case, values, prefilter)
     want = reference(case, values, prefilter)
     tolerance = {"rtol": 1e-8, "atol": 1e-10} if prefilter == "pixel" else {"rtol": 1e-9, "atol": 1e-12}
@@ -51,7 +51,7 @@ def test_every_fragment_of_the_brute_force_is_found(
 
 def test_bounds_leave_most_tiles_out() -> None:
     case = random_scene(200, 1, width=320, height=240, scale=0.05)
-    _, projection = traced(case, [case.params[name] for name in SURFEL_KEYS])
+    _, projection = traced(case, [case.params[name] for name in GEOMETRY])
     tracer = backend.module(torch.device("cpu")).Trace_f64()
     tracer.run(**projection.view(projection.geom), most=0)
     boxes = (2 * projection.radii / 16 + 1).clamp(max=20).prod(-1).sum()
@@ -63,8 +63,8 @@ def test_bounds_leave_most_tiles_out() -> None:
 def test_discs_across_the_camera_plane_are_listed_where_they_show(seed: int, dtype: torch.dtype) -> None:
     """Discs without a box are culled beyond the borders and listed in tiles that they reach."""
     case = crossing_scene(120, seed)
-    fragments, projection = traced(case, [case.params[name].to(dtype) for name in SURFEL_KEYS])
-    want = reference(case, [case.params[name] for name in SURFEL_KEYS]).weight
+    fragments, projection = traced(case, [case.params[name].to(dtype) for name in GEOMETRY])
+    want = reference(case, [case.params[name] for name in GEOMETRY]).weight
     found = dense(fragments, fragments.weight, 120)
     assert ((found > 0) != (want > 0)).double().mean() < (1e-12 if dtype == torch.float64 else 1e-4)
     shown, seen = tiles_reached(want, case.width, case.height), projection.radii[:, 0] > 0
@@ -91,7 +91,7 @@ def test_a_disc_out_of_view_keeps_its_low_pass() -> None:
         "log_scales": torch.zeros(1, 2, dtype=torch.float64),
         "opacity_logits": torch.full((1,), 3.0, dtype=torch.float64),
     }
-    values = [case.params[name] for name in SURFEL_KEYS]
+    values = [case.params[name] for name in GEOMETRY]
     fragments, projection = traced(case, values)
     want = reference(case, values).weight
     assert (want > 0).sum() == 7 and 2 < float(projection.radii.max()) < 3
@@ -100,7 +100,7 @@ def test_a_disc_out_of_view_keeps_its_low_pass() -> None:
 
 def test_a_disc_whose_centre_is_a_million_pixels_away() -> None:
     case = far_floor()
-    values = [case.params[name] for name in SURFEL_KEYS]
+    values = [case.params[name] for name in GEOMETRY]
     fragments, projection = traced(case, values)
     want = reference(case, values).weight
     assert (want > 0).sum() > 300 and float(projection.geom[0, 0]) > 1e6

@@ -8,7 +8,7 @@ from bitymi_ns.ops.backend import emulated_cuda, kernel, module
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from tests.cuda.conftest import why_not_emulated
-from tests.ops.golden import SURFEL_KEYS, camera_of, random_scene, traced
+from tests.ops.golden import GEOMETRY, camera_of, random_scene, traced
 
 emulated = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not_emulated()))
 
@@ -16,7 +16,7 @@ emulated = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not
 @emulated
 def test_the_tracers_refuse_each_others_tensors() -> None:
     case = random_scene(5, 1, width=24, height=20)
-    _, projection = traced(case, [case.params[name] for name in SURFEL_KEYS])
+    _, projection = traced(case, [case.params[name] for name in GEOMETRY])
     geom = projection.geom.detach()
     with pytest.raises(RuntimeError, match=r"bin_cuda.tile_lists runs on a CUDA device only, .* call `trace`"):
         trace_cuda.find_fragments(geom, projection)

@@ -16,8 +16,8 @@ from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import front, textured
 from tests.ops.golden import (
+    GEOMETRY,
     GOLDEN_NAMES,
-    SURFEL_KEYS,
     SV_KEYS,
     SceneCase,
     atlas_of,
@@ -159,7 +159,7 @@ def test_random_scenes_in_single_precision(seed: int) -> None:
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
-    geometry = [leaves[key] for key in SURFEL_KEYS]
+    geometry = [leaves[key] for key in GEOMETRY]
     want = reference_render.render(geometry, colors, case, case.background)
     generator = torch.Generator().manual_seed(seed)
     loss, reference_loss = 0.0, 0.0
@@ -324,7 +324,7 @@ def test_results_do_not_depend_on_the_number_of_threads_beyond_rounding() -> Non
 def test_wrong_inputs_are_refused() -> None:
     case = random_scene(4, 0)
     scene, camera = scene_of(case, torch.float32)
-    p = {key: scene.surfels[key].detach() for key in SURFEL_KEYS}
+    p = {key: scene.surfels[key].detach() for key in GEOMETRY}
     with pytest.raises(ValueError, match="quats must have shape"):
         ops.project(**{**p, "quats": p["quats"][:, :3]}, camera=camera)
     with pytest.raises(TypeError, match="float32 or float64"):

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
+from bitymi_ns.measure.stability.scenes import GEOMETRY, SceneCase, random_scene
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.scene import Scene, SceneConfig
@@ -20,7 +20,7 @@ from tests.ops.golden import camera_of, dense, reference, traced
 
 def test_the_launch_chooses_the_kernel_and_not_the_row() -> None:
     case = random_scene(40, 3, scale=0.25)
-    values = [case.params[name].double() for name in SURFEL_KEYS]
+    values = [case.params[name].double() for name in GEOMETRY]
     wanted, plain = traced(case, values)
     _, filtered = traced(case, values, prefilter="pixel")
     assert (filtered.geom[:, 15] > 0).any() and not (plain.geom[:, 15] > 0).any()
@@ -32,7 +32,7 @@ def test_the_launch_chooses_the_kernel_and_not_the_row() -> None:
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 def test_fragments_and_gradients_agree_with_the_reference(scale: float, dtype: torch.dtype) -> None:
     case = random_scene(40, 3, scale=scale)
-    values = [case.params[name].to(dtype).requires_grad_() for name in SURFEL_KEYS]
+    values = [case.params[name].to(dtype).requires_grad_() for name in GEOMETRY]
     fragments, _ = traced(case, values, prefilter="pixel")
     exact = [value.detach().double().requires_grad_() for value in values]
     want = reference(case, exact, prefilter="pixel")
@@ -54,7 +54,7 @@ def test_fragments_and_gradients_agree_with_the_reference(scale: float, dtype: t
         wanted = wanted + (expected * weight).sum()
     loss.backward()
     wanted.backward()
-    for name, value, reference_value in zip(SURFEL_KEYS, values, exact, strict=True):
+    for name, value, reference_value in zip(GEOMETRY, values, exact, strict=True):
         scale_of = reference_value.grad.abs().max()
         error = (value.grad.double() - reference_value.grad).abs().max() / scale_of
         assert error < (1e-9 if dtype == torch.float64 else 5e-3), (name, error)

@@ -10,8 +10,8 @@ from bitymi_ns.ops.reference.project import project
 from bitymi_ns.ops.reference.render import Render, render
 from bitymi_ns.ops.reference.view_color import sv, view_directions
 from tests.ops.golden import (
+    GEOMETRY,
     GOLDEN_NAMES,
-    SURFEL_KEYS,
     SV_KEYS,
     SceneCase,
     extreme_scenes,
@@ -25,7 +25,7 @@ EXTREME = {case.name: case for case in extreme_scenes()}
 
 def render_case(case: SceneCase, params: dict[str, Tensor], tiles: list[Tensor] | None) -> Render:
     colors = sv(*(params[key] for key in SV_KEYS), view_directions(params["means"], case.viewmat))
-    return render([params[key] for key in SURFEL_KEYS], colors, case, case.background, tiles)
+    return render([params[key] for key in GEOMETRY], colors, case, case.background, tiles)
 
 
 def leaves(case: SceneCase) -> tuple[dict[str, Tensor], list[Tensor] | None]:
@@ -86,7 +86,7 @@ def test_extreme_scenes_do_what_they_are_named_after() -> None:
 def test_homography_and_normal_agree_with_gsplat() -> None:
     impl = pytest.importorskip("gsplat.cuda._torch_impl_2dgs")
     case = random_scene(50, 3)
-    means, quats, log_scales, opacity_logits, beta_raw = (case.params[key] for key in SURFEL_KEYS)
+    means, quats, log_scales, opacity_logits, beta_raw = (case.params[key] for key in GEOMETRY)
     p = project(means, quats, log_scales, opacity_logits, beta_raw, case.viewmat, case.K)
     scales = torch.cat([log_scales.exp(), torch.ones_like(log_scales[:, :1])], dim=-1)
     _, _, depths, M, normals = impl._fully_fused_projection_2dgs(
@@ -122,7 +122,7 @@ def test_a_residual_field_equal_to_a_tile_gives_the_same_picture() -> None:
     case = random_scene(10, 5)
     add = torch.tensor([0.2, -0.3, 0.1], dtype=torch.float64)
     colors = sv(*(case.params[key] for key in SV_KEYS), view_directions(case.params["means"], case.viewmat))
-    arguments = ([case.params[key] for key in SURFEL_KEYS], colors, case)
+    arguments = ([case.params[key] for key in GEOMETRY], colors, case)
     tiled = render(*arguments, tiles=[add.expand(4, 4, 3)] * 10)
     with_field = render(*arguments, residual=lambda x: add.expand(x.shape[0], 3))
     assert torch.allclose(tiled.rgb, with_field.rgb, atol=1e-14)

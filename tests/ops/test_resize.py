@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SceneCase, random_scene
+from bitymi_ns.measure.stability.scenes import GEOMETRY, SceneCase, random_scene
 from bitymi_ns.ops import baked_cpu
 from bitymi_ns.ops.baked_scene import halved, tile_levels
 from bitymi_ns.ops.constants import SUPPORT
@@ -29,7 +29,7 @@ def drawn(case: SceneCase, photo_pixel: float) -> torch.Tensor:
 def test_coverage_depth_and_normals_agree_with_the_reference(scale: float, photo_pixel: float) -> None:
     case = random_scene(40, 3, scale=scale)
     image, overdraw = baked_cpu.frame(scene_of(case), camera_of(case, torch.float32), True, photo_pixel)
-    values = [case.params[name].double() for name in SURFEL_KEYS]
+    values = [case.params[name].double() for name in GEOMETRY]
     projected = reference_project.project(*values, case.viewmat, case.K)
     want = reference_trace.trace(projected, case.width, case.height, photo_pixel=photo_pixel)
     shape = (case.height, case.width)
@@ -91,7 +91,7 @@ def test_any_surfel_stays_finite(seed: int, log_scale: float, photo_pixel: float
 
 def test_resized_surfels_are_neither_traced_nor_learned() -> None:
     case = random_scene(5, 0)
-    values = [case.params[name].float() for name in SURFEL_KEYS]
+    values = [case.params[name].float() for name in GEOMETRY]
     with pytest.raises(ValueError, match="baked renderer alone"):
         ops.trace(ops.project(*values, camera_of(case, torch.float32), photo_pixel=0.5))
     values[0].requires_grad_()

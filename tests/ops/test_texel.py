@@ -14,7 +14,7 @@ from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
-from tests.ops.golden import SURFEL_KEYS, SceneCase, random_scene, reference_colors
+from tests.ops.golden import GEOMETRY, SceneCase, random_scene, reference_colors
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 
@@ -25,7 +25,7 @@ def listed(
     """Trace a scene: fragments and projection."""
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
     with torch.no_grad():
-        projection = ops.project(*(case.params[key].to(device, dtype) for key in SURFEL_KEYS), camera)
+        projection = ops.project(*(case.params[key].to(device, dtype) for key in GEOMETRY), camera)
         return ops.trace(projection), projection
 
 

@@ -8,7 +8,7 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.errors import Backend
-from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, front_scene
+from bitymi_ns.measure.stability.scenes import GEOMETRY, SV_KEYS, front_scene
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
@@ -82,7 +82,7 @@ def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend
     colors = reference_view_color.sv(
         *(doubles[key] for key in SV_KEYS), view_directions(doubles["means"], case.viewmat)
     )
-    geometry = [doubles[key] for key in SURFEL_KEYS]
+    geometry = [doubles[key] for key in GEOMETRY]
     want = reference_render.render(geometry, colors, replace(case, K=case.K.float().double()), tiles=patches)
     drawn = set(want.trace.blended.nonzero()[:, 1].tolist())
     assert len(drawn) == n, "every tile is seen"

@@ -7,8 +7,8 @@ from bitymi_ns import ops
 from bitymi_ns.measure.stability.errors import Backend, against_extended, measure
 from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE, Case, cases
 from bitymi_ns.measure.stability.scenes import (
+    GEOMETRY,
     PLAIN,
-    SURFEL_KEYS,
     SWEEPS,
     WAYS,
     SceneCase,
@@ -85,7 +85,7 @@ def test_far_from_the_origin_only_the_rounding_of_positions_shows(backend: Backe
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-@pytest.mark.parametrize("name", SURFEL_KEYS)
+@pytest.mark.parametrize("name", GEOMETRY)
 def test_a_row_that_is_not_finite_is_dropped_and_counted(name: str, value: float, backend: Backend) -> None:
     case = random_scene(20, 0)
     case.params[name][3] = value

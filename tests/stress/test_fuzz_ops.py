@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import SURFEL_KEYS, SV_KEYS, random_scene
+from bitymi_ns.measure.stability.scenes import GEOMETRY, SV_KEYS, random_scene
 from bitymi_ns.ops.field import FieldGeometry
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
@@ -38,7 +38,7 @@ def surfels(draw: st.DrawFn, broken: bool) -> dict[str, Tensor]:
     params = {key: value[:n].float() for key, value in case.params.items()}
     values = EXTREME + (BROKEN if broken else ())
     for _ in range(draw(st.integers(0, 12)) if n else 0):
-        key = draw(st.sampled_from(SURFEL_KEYS + ("sv_sites", "sv_log_tau")))
+        key = draw(st.sampled_from(GEOMETRY + ("sv_sites", "sv_log_tau")))
         flat = params[key].view(-1)
         flat[draw(st.integers(0, flat.numel() - 1))] = draw(st.sampled_from(values))
     return params
@@ -68,9 +68,9 @@ def test_rendering_any_numbers(params: dict[str, Tensor], camera: Camera, prefil
     finite = {key: bool(value.isfinite().all()) for key, value in params.items()}
     leaves = {key: value.clone().requires_grad_() for key, value in params.items()}
     n = len(leaves["means"])
-    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, prefilter)
+    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, near, prefilter)
     rows = torch.ones(n, dtype=torch.bool)
-    for key in SURFEL_KEYS:
+    for key in GEOMETRY:
         rows &= params[key].view(n, max(1, params[key][:1].numel())).isfinite().all(-1) if n else rows
     assert projection.not_finite == int((~rows).sum())
     assert not (projection.visible & ~rows).any()
@@ -96,7 +96,7 @@ def test_shapes_and_dtypes_that_do_not_fit_are_refused(data: st.DataObject) -> N
     case = random_scene(7, 1, 16, 12)
     params = {key: value.float() for key, value in case.params.items()}
     camera = Camera(case.viewmat.float(), case.K.float(), 16, 12)
-    projection = ops.project(*(params[key] for key in SURFEL_KEYS), camera)
+    projection = ops.project(*(params[key] for key in GEOMETRY), camera)
     fragments = ops.trace(projection)
     base = ops.view_color("sv", params, params["means"], camera.exact_center)
     colors = torch.rand(len(fragments), 3)
@@ -130,7 +130,7 @@ def test_shapes_and_dtypes_that_do_not_fit_are_refused(data: st.DataObject) -> N
         assert all(t.isfinite().all() for t in (out if isinstance(out, tuple) else (out,)))
 
     calls = {
-        "project": ([params[key] for key in SURFEL_KEYS], lambda *a: ops.project(*a, camera).radii),
+        "project": ([params[key] for key in GEOMETRY], lambda *a: ops.project(*a, camera).radii),
         "view_color": (
             [*(params[key] for key in SV_KEYS), params["means"], camera.exact_center],
             lambda a, b, c, m, o: ops.view_color("sv", dict(zip(SV_KEYS, (a, b, c), strict=True)), m, o),
@@ -155,7 +155,7 @@ def test_shapes_and_dtypes_that_do_not_fit_are_refused(data: st.DataObject) -> N
 def test_fragments_of_one_scene_are_not_taken_for_those_of_another() -> None:
     few, many = (random_scene(n, 1, 16, 12) for n in (3, 9))
     camera = Camera(many.viewmat.float(), many.K.float(), 16, 12)
-    projections = [ops.project(*(case.params[key].float() for key in SURFEL_KEYS), camera) for case in (few, many)]
+    projections = [ops.project(*(case.params[key].float() for key in GEOMETRY), camera) for case in (few, many)]
     fragments = ops.trace(projections[1])
     with pytest.raises(ValueError, match="those of 9 surfels, not of 3"):
         ops.blended_image(fragments, projections[0], torch.rand(9, 3))
@@ -184,12 +184,12 @@ def test_strided_views_give_what_their_copies_give(seed: int, step: int, double:
     for make in (strided, lambda tensor: tensor.to(dtype)):
         leaves = {key: make(value).requires_grad_() for key, value in case.params.items()}
         transposed = leaves["means"].detach().T.contiguous().T.requires_grad_()
-        projection = ops.project(transposed, *(leaves[key] for key in SURFEL_KEYS[1:]), camera)
+        projection = ops.project(transposed, *(leaves[key] for key in GEOMETRY[1:]), camera)
         fragments = ops.trace(projection)
         base = ops.view_color("sv", leaves, transposed, camera.exact_center, projection.visible)
         image = ops.blended_image(fragments, projection, base)
         image.square().sum().backward()
-        results.append([image.detach(), transposed.grad, *(leaves[key].grad for key in SURFEL_KEYS[1:])])
+        results.append([image.detach(), transposed.grad, *(leaves[key].grad for key in GEOMETRY[1:])])
     for a, b in zip(*results, strict=True):
         assert torch.equal(a, b)
 

@@ -14,8 +14,8 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import (
     ALPHAS,
+    GEOMETRY,
     PLAIN,
-    SURFEL_KEYS,
     SV_KEYS,
     TEXELS,
     SceneCase,
@@ -168,7 +168,7 @@ def _signs(like: Tensor, generator: torch.Generator) -> Tensor:
 def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, way: Way) -> _Result:
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
-    projection = ops.project(*(leaves[key] for key in SURFEL_KEYS), camera, near, way.prefilter)
+    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, near, way.prefilter)
     if way.alpha:
         projection.alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0)
     fragments = ops.trace(projection, way.rim)
@@ -191,7 +191,7 @@ def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = reference_render.view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
-    geometry = [leaves[key] for key in SURFEL_KEYS]
+    geometry = [leaves[key] for key in GEOMETRY]
     texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]
     tiles = tile_images(torch.cat(texels, 1)) if texels else None
     result = reference_render.render(
@@ -276,10 +276,10 @@ def against_extended(case: SceneCase, backend: Backend | None = None, near: floa
         with backend.use():
             got = _by_kernels(rounded, backend.device, torch.float64, near, replace(PLAIN, rim=1e-30))
     names = ("alpha", "depth", "normal", "beta_map")
-    plain = {key: rounded.params[key].numpy() for key in SURFEL_KEYS}
+    plain = {key: rounded.params[key].numpy() for key in GEOMETRY}
 
     def run(params: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], extended.Extended]:
-        result = extended.render([params[key] for key in SURFEL_KEYS], rounded, near)
+        result = extended.render([params[key] for key in GEOMETRY], rounded, near)
         arrays = (result.alpha[:, None], result.depth[:, None], result.normal, result.beta[:, None])
         return dict(zip(names, arrays, strict=True)), result
 
@@ -292,7 +292,7 @@ def against_extended(case: SceneCase, backend: Backend | None = None, near: floa
     weights = _loss_weights(exact)
     grads = _gradients(replace(got, images={key: got.images[key] for key in names}), weights, pixels)
     rng, worst, step = np.random.default_rng(0), 0.0, np.longdouble(1e-200)
-    for key in SURFEL_KEYS:
+    for key in GEOMETRY:
         direction = rng.standard_normal(plain[key].shape)
         moved, _ = run({**plain, key: plain[key] + 1j * step * direction.astype(np.clongdouble)})
         terms = [np.where(same[:, None], weights[name].numpy(), 0.0) * moved[name].imag for name in names]

@@ -10,9 +10,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import VIEW_COLORS, Prefilter, TexelTiles
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ops.project import GEOMETRY
 
-SURFEL_KEYS = GEOMETRY
 SV_KEYS = VIEW_COLORS["sv"].names
 
 
@@ -21,7 +19,7 @@ class SceneCase:
     """A scene and a camera, all float64."""
 
     name: str
-    params: dict[str, Tensor]  # SURFEL_KEYS and SV_KEYS, as in docs/overview.md
+    params: dict[str, Tensor]  # GEOMETRY and SV_KEYS, as in docs/overview.md
     viewmat: Tensor  # [4, 4]
     K: Tensor  # [3, 3]
     width: int

@@ -28,12 +28,13 @@ from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig, BundleCamer
 from bitymi_ns.plugin.data.dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
 from bitymi_ns.plugin.data.depth import with_depth
 from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.background_points import background_points
 from bitymi_ns.train.exposure import restored
 from bitymi_ns.train.poses import carried, cross_matrix
 from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import MemoryBudget, OnDemand, View, spread, training_order
+from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
 
 ALPHA_SAMPLES = 8  # photographs that are searched for transparent pixels
 FEW_VIEWS = 10  # training views below which multi-view scores are unreliable

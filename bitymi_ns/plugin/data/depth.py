@@ -18,7 +18,7 @@ from bitymi_ns.capture.lens import Lens, Pinhole
 from bitymi_ns.capture.points import GREY
 from bitymi_ns.capture.types import MapFiles
 from bitymi_ns.plugin.console import say, warn
-from bitymi_ns.train.views import spread
+from bitymi_ns.ranges import spread
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
 """metric = one scale for all maps; relative = scale and shift of each; auto = by agreement with the points; off =

@@ -17,12 +17,13 @@ from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.texels import SMALLEST, most_texels
-from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget, spread
+from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget
 
 COUNTED_VIEWS = 3  # views with counted fragments
 MARGIN = 1.1  # factor by which other views may have more fragments

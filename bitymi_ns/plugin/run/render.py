@@ -23,8 +23,8 @@ from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
 from bitymi_ns.plugin.run.films import RATES, check_frames, film, frames
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.progress import rich_progress
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.baked import as_bytes
-from bitymi_ns.train.views import spread
 
 TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
 """nerfstudio's script classes that render along a path."""

@@ -25,8 +25,8 @@ from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import FAR, camera_of, front, layered, scene_of, textured, to_average
 from tests.ops.golden import (
+    GEOMETRY,
     GOLDEN_NAMES,
-    SURFEL_KEYS,
     SceneCase,
     atlas_of,
     crossing_scene,
@@ -107,7 +107,7 @@ def test_discs_across_the_camera_plane_are_drawn_where_they_show(seed: int, phot
     assert (np.abs(counts - want) > 0.5).mean() < 2e-3
     if photo_pixel < 1:
         return
-    shows = (reference(case, [case.params[name] for name in SURFEL_KEYS]).weight > 0).view(120, 150, -1)
+    shows = (reference(case, [case.params[name] for name in GEOMETRY]).weight > 0).view(120, 150, -1)
     boxes = [(x.any(0).sum() * x.any(1).sum()).item() for x in shows.unbind(-1) if x.any()]
     drawn = [covered(r, 150, 120) for r in rectangles(device)]
     assert len(drawn) <= len(boxes) + 8  # not beyond a single border

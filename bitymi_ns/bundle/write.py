@@ -88,10 +88,11 @@ def write_bundle(
     surfels = scene.surfels
     _check_surfels(scene)
     _check_alpha(scene, atlas, codes)
-    for name in (*(extra_files or {}), *(loose_files or {})):
-        check_file_name(name, "extra_files")
-        if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, NOTES):
-            raise BundleError(f"extra_files may not replace {name}")
+    for argument, names in (("extra_files", extra_files or {}), ("loose_files", loose_files or {})):
+        for name in names:
+            check_file_name(name, argument)
+            if name in (SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, NOTES):
+                raise BundleError(f"{argument} may not replace {name}")
     info = _describe(scene, atlas, background, world or World(), statistics)
     parts = {} if codes is None else _compact_parts(codes, info)
     try:

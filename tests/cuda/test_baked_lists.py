@@ -6,11 +6,12 @@ from torch import Tensor
 
 from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.baked_cuda import Stage, Workspace, slots_per_tile
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.cuda.baked_scenes import FLIP, camera_of, front, listed_pairs, most, scene_of
-from tests.ops.golden import GEOMETRY, crossing_scene, random_scene, reference, tiles_reached
+from tests.ops.golden import crossing_scene, random_scene, reference, tiles_reached
 
 
 def mask_pixels(renderer: BakedRenderer, surfels: int, width: int, height: int) -> int:

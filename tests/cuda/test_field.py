@@ -6,8 +6,9 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene import Camera, HashField
-from tests.ops.golden import GEOMETRY, random_scene
+from tests.ops.golden import random_scene
 from tests.ops.test_kernels import make_field, relative
 
 

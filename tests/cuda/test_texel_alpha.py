@@ -10,8 +10,9 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.project import GEOMETRY
 from tests.cuda.test_trace import by_pixel_and_surfel
-from tests.ops.golden import GEOMETRY, SceneCase, camera_of, random_scene, relative
+from tests.ops.golden import SceneCase, camera_of, random_scene, relative
 
 CpuContext = Callable[[], AbstractContextManager[None]]
 

@@ -13,11 +13,11 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import bin_cuda, capacity, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, workspace
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera
 from tests.ops.golden import (
-    GEOMETRY,
     GOLDEN_NAMES,
     SV_KEYS,
     SceneCase,

@@ -10,14 +10,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import (
-    GEOMETRY,
-    SV_KEYS,
-    SceneCase,
-    extreme_scenes,
-    quaternions,
-    random_scene,
-)
+from bitymi_ns.measure.stability.scenes import SV_KEYS, SceneCase, extreme_scenes, quaternions, random_scene
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.ops.reference.render import texel
@@ -26,7 +20,6 @@ from bitymi_ns.scene import Camera
 
 __all__ = [
     "GOLDEN_NAMES",
-    "GEOMETRY",
     "SV_KEYS",
     "Golden",
     "SceneCase",

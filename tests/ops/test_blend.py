@@ -8,15 +8,8 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
-from tests.ops.golden import (
-    GEOMETRY,
-    SceneCase,
-    camera_of,
-    composite_colors,
-    load_golden,
-    random_scene,
-    reference_colors,
-)
+from bitymi_ns.ops.project import GEOMETRY
+from tests.ops.golden import SceneCase, camera_of, composite_colors, load_golden, random_scene, reference_colors
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 BOUND = 0.03

@@ -8,7 +8,8 @@ from bitymi_ns.ops import trace_cpu
 from bitymi_ns.ops.backend import function, kernel_class, module
 from bitymi_ns.ops.constants import TILE
 from bitymi_ns.ops.fragment_list import empty_ids, empty_list
-from tests.ops.golden import GEOMETRY, camera_of, random_scene
+from bitymi_ns.ops.project import GEOMETRY
+from tests.ops.golden import camera_of, random_scene
 
 
 def blocks_of(projection: ops.Projection) -> dict[str, torch.Tensor]:

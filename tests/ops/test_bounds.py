@@ -9,16 +9,8 @@ from hypothesis import strategies as st
 
 from bitymi_ns.measure.stability.scenes import quaternions
 from bitymi_ns.ops import backend
-from tests.ops.golden import (
-    GEOMETRY,
-    crossing_scene,
-    dense,
-    far_floor,
-    random_scene,
-    reference,
-    tiles_reached,
-    traced,
-)
+from bitymi_ns.ops.project import GEOMETRY
+from tests.ops.golden import crossing_scene, dense, far_floor, random_scene, reference, tiles_reached, traced
 
 
 @pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])

@@ -5,10 +5,11 @@ import torch
 
 from bitymi_ns.ops import baked, trace_cpu, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, module
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from tests.cuda.conftest import why_not_emulated
-from tests.ops.golden import GEOMETRY, camera_of, random_scene, traced
+from tests.ops.golden import camera_of, random_scene, traced
 
 emulated = pytest.mark.skipif(why_not_emulated() is not None, reason=str(why_not_emulated()))
 

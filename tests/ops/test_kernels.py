@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
@@ -16,7 +17,6 @@ from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import front, textured
 from tests.ops.golden import (
-    GEOMETRY,
     GOLDEN_NAMES,
     SV_KEYS,
     SceneCase,

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.measure.stability.scenes import GEOMETRY, SceneCase, random_scene
+from bitymi_ns.measure.stability.scenes import SceneCase, random_scene
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.scene import Scene, SceneConfig

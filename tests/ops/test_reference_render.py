@@ -6,18 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.reference.project import project
 from bitymi_ns.ops.reference.render import Render, render
 from bitymi_ns.ops.reference.view_color import sv, view_directions
-from tests.ops.golden import (
-    GEOMETRY,
-    GOLDEN_NAMES,
-    SV_KEYS,
-    SceneCase,
-    extreme_scenes,
-    load_golden,
-    random_scene,
-)
+from tests.ops.golden import GOLDEN_NAMES, SV_KEYS, SceneCase, extreme_scenes, load_golden, random_scene
 
 IMAGES = ("rgb", "alpha", "depth", "beta_map")
 EXTREME = {case.name: case for case in extreme_scenes()}

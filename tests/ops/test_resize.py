@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import GEOMETRY, SceneCase, random_scene
+from bitymi_ns.measure.stability.scenes import SceneCase, random_scene
 from bitymi_ns.ops import baked_cpu
 from bitymi_ns.ops.baked_scene import halved, tile_levels
 from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.scene.baked import BakedScene

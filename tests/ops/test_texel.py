@@ -12,9 +12,10 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import cuda_backend
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
-from tests.ops.golden import GEOMETRY, SceneCase, random_scene, reference_colors
+from tests.ops.golden import SceneCase, random_scene, reference_colors
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 

@@ -6,15 +6,8 @@ import torch
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.errors import Backend, against_extended, measure
 from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE, Case, cases
-from bitymi_ns.measure.stability.scenes import (
-    GEOMETRY,
-    PLAIN,
-    SWEEPS,
-    WAYS,
-    SceneCase,
-    Sweep,
-    random_scene,
-)
+from bitymi_ns.measure.stability.scenes import PLAIN, SWEEPS, WAYS, SceneCase, Sweep, random_scene
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 
 CASES = cases()

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import GEOMETRY, SV_KEYS, random_scene
+from bitymi_ns.measure.stability.scenes import SV_KEYS, random_scene
 from bitymi_ns.ops.field import FieldGeometry
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import (
     ALPHAS,
-    GEOMETRY,
     PLAIN,
     SV_KEYS,
     TEXELS,
@@ -25,9 +24,11 @@ from bitymi_ns.measure.stability.scenes import (
     tiles_of,
 )
 from bitymi_ns.ops.backend import emulated_cuda, module
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.reference import extended
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene.camera import Camera
 
 
@@ -189,7 +190,7 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
 
 def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
-    directions = reference_render.view_directions(leaves["means"], case.viewmat)
+    directions = view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
     geometry = [leaves[key] for key in GEOMETRY]
     texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]

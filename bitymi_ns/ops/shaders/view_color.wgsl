@@ -17,7 +17,7 @@ const SH_C3B: f32 = 2.890611442640554;
 const SH_C3C: f32 = 0.4570457994644658;
 const SH_C3E: f32 = 0.3731763325901154;
 const SH_C3F: f32 = 1.445305721320277;
-const LOBE_SLOPE: f32 = 6.931471805599453;
+const LOBE_SHARPNESS: f32 = 6.931471805599453;
 
 @group(0) @binding(2) var<storage, read> terms: array<f32>;
 
@@ -90,8 +90,8 @@ fn harmonics(s: Surfel, d: vec3f) -> vec3f {
 }
 
 fn lobe_softplus(x: vec3f) -> vec3f {
-  let a = LOBE_SLOPE * x;
-  return (max(a, vec3f(0.0)) + log(1.0 + exp(-abs(a)))) / LOBE_SLOPE;
+  let a = LOBE_SHARPNESS * x;
+  return (max(a, vec3f(0.0)) + log(1.0 + exp(-abs(a)))) / LOBE_SHARPNESS;
 }
 
 fn beta_lobes(s: Surfel, d: vec3f) -> vec3f {

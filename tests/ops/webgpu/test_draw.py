@@ -19,21 +19,13 @@ from bitymi_ns.codec.bc7_encode import bc7_encoder
 from bitymi_ns.ops import webgpu
 from bitymi_ns.ops.baked_cpu import draw as draw_on_cpu
 from bitymi_ns.ops.baked_scene import decode_bc7
+from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.ops.webgpu import device, on_device
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import FAR, camera_of, front, layered, scene_of, textured, to_average
-from tests.ops.golden import (
-    GEOMETRY,
-    GOLDEN_NAMES,
-    SceneCase,
-    atlas_of,
-    crossing_scene,
-    extreme_scenes,
-    load_golden,
-    reference,
-)
+from tests.ops.golden import GOLDEN_NAMES, SceneCase, atlas_of, crossing_scene, extreme_scenes, load_golden, reference
 from tests.ops.test_view_color import lean_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")

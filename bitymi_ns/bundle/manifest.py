@@ -171,7 +171,7 @@ class AtlasEntry(Part):
     file: Literal["atlas.ktx2", "texels.bin"] = ATLAS
     format: Literal["bc7", "uint8", "fp16", "dct"]
     texels: Whole | None = None  # texels of all tiles in texels.bin
-    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # at grade 0 (`texel_codes.GRADES`), in texels.bin
+    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # of coefficients at grade 0 (`texel_codes.GRADES`)
     page_width: Side | None = None
     page_rows: Side | None = None
     """Arguments of `codec.packing.pack`, which gives the packing from the tile sizes."""

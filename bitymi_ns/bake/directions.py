@@ -34,9 +34,9 @@ class Directions:
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
     """Yield the directions of all surfels, in chunks of surfels that about equally many views see.
 
-    Beside those of the views that see a surfel there are BETWEEN others: random points of the triangles of three such
-    views, a quarter larger, with the same random numbers for every surfel. A surfel that no view sees has SPHERE
-    directions.
+    A surfel has the directions of the views that see it and BETWEEN others: random points of triangles between three of
+    these, each triangle enlarged by a quarter, with the same random numbers for every surfel. A surfel that no view
+    sees has SPHERE directions.
 
     Args:
         means: [N, 3] world positions.

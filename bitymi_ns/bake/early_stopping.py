@@ -13,14 +13,14 @@ from bitymi_ns.train.views import OnDemand, View
 
 S = TypeVar("S")
 
-FEWEST_VIEWS = 4  # with fewer views there are no validation views, and nothing is optimised
+FEWEST_VIEWS = 4  # with fewer views nothing is optimised, except by `tune_atlas` without validation
 
 
 class EarlyStopping(Generic[S]):
     """Best state by the PSNR of validation views.
 
     Attributes:
-        best: the state with the highest PSNR, `first` included; the last one without validation views.
+        best: the state with the highest PSNR, `first` included; without validation views, the last.
         curve: (step, dB over the validation views) of every evaluation.
         done: steps before the last evaluation.
     """

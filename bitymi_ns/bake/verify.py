@@ -13,7 +13,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.scene.visibility import visibility
 
-_SLACK = 1.02  # sums in another order, rotations that were written with length 1
+_SLACK = 1.02  # largest ratio to the stated error: sums in another order, rotations that were written with length 1
 
 
 def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
@@ -21,7 +21,7 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
 
     Args:
         bundle: what `check_files` read.
-        surfels: per-surfel parameters of the scene that was baked; a surfel of the bundle is found by its geometry.
+        surfels: per-surfel parameters of the scene that was baked; `_keys` match them to the bundle's.
         cameras: its training views.
     """
     name = "error of the view colours"

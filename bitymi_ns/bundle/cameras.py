@@ -35,8 +35,8 @@ class CapturedCamera(BaseModel):
         width, height, fx, fy, cx, cy: of the photograph, in pixels.
         viewmat: [16] world to camera by rows, OpenCV axes.
         photograph: file of the bundle with the photograph, possibly reduced; None if it has none.
-        correction: of the scene's colours, not of the background, to the photograph's: 3 gains, or 12 numbers, matrix
-            and offset [3, 4] by rows; None: mean exposure.
+        correction: maps colours of the scene, but not the background, to the photograph's: 3 gains, or 12 numbers,
+            matrix and offset [3, 4] by rows; None: mean exposure.
     """
 
     name: str

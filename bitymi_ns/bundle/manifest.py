@@ -106,8 +106,8 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class ColumnEntry(Part):
-    """An integer column: `bytes` of `streams.compress`, or, before version 5, `low` and `planes` of
-    `streams.decompress_planes`."""
+    """Integer column: `bytes` are the `sizes` of `streams.Compressed`; before version 5, `low` and `planes` are the
+    arguments of `streams.decompress_planes`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,20}$")]
     step: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
@@ -171,7 +171,7 @@ class AtlasEntry(Part):
     file: Literal["atlas.ktx2", "texels.bin"] = ATLAS
     format: Literal["bc7", "uint8", "fp16", "dct"]
     texels: Whole | None = None  # texels of all tiles in texels.bin
-    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # step of coefficients of grade 0 in texels.bin
+    step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # of coefficients at grade 0 (`texel_codes.GRADES`)
     page_width: Side | None = None
     page_rows: Side | None = None
     """Arguments of `codec.packing.pack`, which gives the packing from the tile sizes."""
@@ -306,7 +306,7 @@ def describe(info: Mapping[str, Any]) -> Manifest:
     """Build the manifest of `info`; arrays become lists, non-finite numbers null.
 
     Raises:
-        BundleError: a value that readers would refuse is missing or out of range.
+        BundleError: a required value is missing, or one is out of range.
     """
     try:
         return Manifest.model_validate_json(strict_json.canonical(strict_json.plain(info)))

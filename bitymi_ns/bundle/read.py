@@ -46,9 +46,9 @@ REMEDY = "Copy the bundle again from where it is whole, or export the scene agai
 BESIDE_LIMIT = 64 << 20
 """Largest file other than surfels and texels, such as a photograph, that is kept in memory, bytes."""
 LARGE_ATLAS = 64 << 20
-"""Bytes of a decoded compact atlas from which a CUDA device gets BC7 blocks, a quarter of the memory. Smaller
-atlases fit any device, and encoding costs time and some quality of texels that were not tuned for BC7."""
-LOAD_PROFILE: Profile = "veryfast"  # of this encoding: the next faster profile loses more than twice as much
+"""Least size in bytes of a decoded compact atlas that is encoded to BC7 for a CUDA device, a quarter of the memory.
+Smaller atlases fit any device, and encoding costs time and some quality of texels that were not tuned for BC7."""
+LOAD_PROFILE: Profile = "veryfast"  # for `LARGE_ATLAS`; the next faster profile loses more than twice as many dB
 CONTENTS = SCENE_FILES | {CAMERAS}  # files used by `assemble`
 _CHUNK = 1 << 22
 
@@ -290,7 +290,8 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
 
 
 def _byte_pages(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
-    """Decode texels to pages [layers, height, width, 4] uint8; rounded first, a texel is scattered as one int32."""
+    """Decode texels to pages [layers, height, width, 4] uint8. Texels are rounded before they are laid out, so
+    that each moves as one int32."""
 
     def whole(colors: np.ndarray, alphas: np.ndarray | None) -> np.ndarray:
         rgba = np.full((len(colors), 4), 255, dtype=np.uint8)

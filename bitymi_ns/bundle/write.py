@@ -126,7 +126,7 @@ def write_bundle(
 
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
-    """Encode the two files of a compact bundle, adding their description to `info`."""
+    """Encode surfels.bin and, if there are texels, texels.bin, adding their description to `info`."""
     of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step, codes.alpha)
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
     info["version"] = "{}.{}".format(*COMPACT_VERSION)
@@ -149,7 +149,7 @@ def _describe(
     world: World,
     statistics: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
-    """Build the arguments of `manifest.describe`, without the list of files."""
+    """Build the `info` of `manifest.describe`, without the list of files."""
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
@@ -203,7 +203,7 @@ def _has_alpha(atlas: EncodedAtlas | None) -> bool:
 
 
 def _check_alpha(scene: BakedScene, atlas: EncodedAtlas | None, codes: SceneCodes | None) -> None:
-    """Check that mean alphas, pages and codes agree on having alpha."""
+    """Check that atlas and codes agree on having alphas, and that an atlas with alphas has mean alphas in range."""
     if codes is not None and codes.texels is not None and (codes.alpha is not None) != _has_alpha(atlas):
         raise BundleError("the atlas and the codes of the texels disagree whether there are alphas")
     if not _has_alpha(atlas):

@@ -100,8 +100,8 @@ def make_source(
 def _find_folder(
     names: Sequence[str], folder: Path, capture: Path, stated: Path | None, downscale: int, need_photos: bool
 ) -> Path:
-    """Find the folder that has most of a model's photographs: `stated`, else in `capture`, or up to three levels above
-    it if it is the model's `folder`.
+    """Find the folder that has most of a model's photographs: `stated`, else one in `capture`. If `capture` is the
+    model's `folder`, those up to three levels above it are searched, too.
 
     Raises:
         CaptureError: photographs are needed, and `stated` is missing or no folder has any.
@@ -152,7 +152,11 @@ def _find_folder(
 
 
 def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks: `stated`, relative to the capture, which must exist, else as in `mask_folder`."""
+    """Find the folder of masks as `mask_folder` does; `stated` is relative to the capture.
+
+    Raises:
+        CaptureError: neither the stated one nor its reduced one exists.
+    """
     try:
         return mask_folder(photographs, capture, None if stated is None else capture / stated, downscale)
     except CaptureError as error:

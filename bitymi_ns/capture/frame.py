@@ -81,8 +81,8 @@ def move_to_world(
 ) -> WorldFrame:
     """Transform a model in place to a world with z up.
 
-    Up is that of the accelerometers if most agree, else GPS's if its positions determine it, else the cameras' mean;
-    scale and north are GPS's if its positions determine them.
+    Up is that of the accelerometers if most agree and GPS's up, if known, is within 45 degrees of it; else GPS's if its
+    positions determine it, else the cameras' mean. Scale and north are GPS's if its positions determine them.
 
     Args:
         gps: latitude, longitude and altitude by name.

@@ -351,7 +351,7 @@ def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[s
         camera model with separate focal lengths, and its parameters after fx, fy, cx, cy (none if SPHERICAL_MODEL).
 
     Raises:
-        CaptureError: COLMAP has no such camera.
+        CaptureError: COLMAP has no such camera, or `values` are too many or too few.
     """
     if kind == "EQUIRECTANGULAR":
         return SPHERICAL_MODEL, ()

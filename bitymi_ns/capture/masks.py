@@ -1,5 +1,4 @@
-"""Masks of photographs: their folder, the mask of a photograph, and the pixels that count, in structure from motion and
-in training; named masks are checked before use."""
+"""Masks of photographs, for structure from motion and for training: finding, reading and checking them."""
 
 import os
 from collections.abc import Sequence
@@ -26,14 +25,14 @@ MIDDLE = 127  # threshold of lossy masks, of 255
 
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks, or of reduced ones (`masks_2` for a `downscale` of 2): `stated`, else the first `masks`
-    beside the folder `photographs`, in it, or in `data`.
+    """Find the folder of masks: `stated`, else the first `masks` beside the folder `photographs`, in it, or in `data`.
+    It need not exist if that of reduced masks does (`masks_2` for a `downscale` of 2).
 
     If `data` is the folder of photographs, or in it, a `masks` beside it may belong to something else. It is used if
     the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`.
 
     Raises:
-        CaptureError: the stated one does not exist.
+        CaptureError: neither the stated one nor its reduced one exists.
     """
     if stated is not None:
         if not _exists(stated, downscale):
@@ -74,7 +73,8 @@ def read_mask(path: Path) -> Image.Image:
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
-    """Threshold a mask to the pixels [H, W] that count: opaque and not black, or above MIDDLE for lossy formats.
+    """Threshold a mask to the pixels [H, W] that count: not wholly transparent, and not black, or above MIDDLE for
+    lossy formats.
 
     As in COLMAP and nerfstudio, masks may hold zeros and ones, or class numbers. JPEG ripples around an edge are a few
     levels above black, but stay below MIDDLE.
@@ -98,8 +98,8 @@ def checked_mask(path: Path) -> Image.Image:
 
 
 def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[Path] | None:
-    """Find masks of photographs by their names in a folder; None = it has none, unless `needed`. Raises CaptureError:
-    only some photographs have a mask."""
+    """Find masks of photographs by their names in a folder; None if it has none and they are not `needed`. Raises
+    CaptureError: a mask is missing otherwise."""
     found = {name: mask_of(masks, name) for name in names}
     missing = [name for name, file in found.items() if file is None]
     if len(missing) == len(found) and not needed:
@@ -115,8 +115,8 @@ def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[
 
 def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | None = None) -> list[Photograph]:
     """Add masks to photographs, and report it: instant-ngp's beside them, where some may be missing, or from a folder
-    `masks` (`mask_folder`). `base`: folder to which names of masks are relative; None = the photographs' common
-    folder. Raises CaptureError: the folder has masks of some photographs only."""
+    `masks` (`mask_folder`). `base`: folder of the photographs, whose paths in it name the masks; None = their
+    common folder. Raises CaptureError: the folder has masks of some photographs only."""
     files = [each.file for each in photographs]
     dynamic = [file.with_name(f"{DYNAMIC_MASK}{file.stem}.png") for file in files]
     found: Sequence[Path | None] | None = [file if os.path.isfile(file) else None for file in dynamic]

@@ -66,7 +66,7 @@ def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
 
 
 def intrinsics(camera: pycolmap.Camera) -> dict[str, object]:
-    """Convert a camera, of COLMAP models up to OPENCV, to nerfstudio's entries."""
+    """Convert a COLMAP camera (OPENCV or one of the four simpler pinhole and radial models) to nerfstudio's entries."""
     distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
     first = sum(len(part) for part in (camera.focal_length_idxs(), camera.principal_point_idxs()))
     distortion |= dict(zip(distortion, camera.params[first:].tolist(), strict=False))

@@ -128,7 +128,7 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
     Args:
         omega: [H, W, 1] from `error_weight`, with the same mask.
         values: [H, W, 1]. Falloff: `RenderOutput.beta`, sum_i w_i beta_i, which carries gradient to the blending
-            weights and to beta. Overdraw: `RenderOutput.soft_overdraw`, sum_i w_i / (w_i + half).
+            weights and to beta. Overdraw: `RenderOutput.soft_overdraw`, see `ops.soft_overdraw`.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
 
     Returns:
@@ -210,8 +210,8 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
     """Map the colours of each half of an image by an affine fit on the other half, clamped to [0, 1]: [H, W, 3].
 
     Compensates exposure and white balance of held-out photographs: matrix [3, 3] and offset [3] are the least squares
-    fit to `target` over the unmasked pixels of the other half. A half is returned unchanged if the other half is not
-    finite, or if fewer than `FITTED` of its pixels count.
+    fit to `target` over the unmasked pixels of the other half. A half is not mapped if the other half is not finite,
+    or if the share of the other half's pixels that count is below `FITTED`.
 
     Args:
         image, target: [H, W, 3] in [0, 1].

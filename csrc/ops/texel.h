@@ -8,7 +8,7 @@
 
 namespace bt {
 
-// Texels of all tiles in one list, rows along v: tile i of r_u x r_v texels starts at first[i]; 0, 0 = no tile.
+// Texels of all tiles in one list, u fastest: tile i of r_u x r_v texels starts at first[i]; 0, 0 = no tile.
 template <class S> struct TexelTiles {
   int64_t n, texels;
   const int64_t* first;  // [n], in texels
@@ -33,7 +33,7 @@ template <class S> struct TexelTiles {
 template <class S> struct TexelPatch {
   const int32_t* size;  // r_u, r_v; 0, 0 = no tile
   const S* tile;        // its texels
-  int64_t first;        // of them
+  int64_t first;        // index of the first in TexelTiles
   S extent;
   Vec3<S> view;  // the colour without residual
 
@@ -57,8 +57,8 @@ template <class S> struct TexelPatch {
     return shaded(view, texel_mix(t, at.weight));
   }
 };
-// Working memory of the backward pass on CUDA: gradient sums of texels, rows of four, the last that of the
-// squares of BlendBackward, or 0.
+// Working memory of the backward pass on CUDA: four gradient sums per texel, those of its three channels and that for
+// `squares` of BlendBackward, or 0.
 template <class S> struct TexelWork {
   S* sums;         // [texels, 4]
   int64_t* exact;  // null, or order-independent sums instead of `sums`: [exact_size(...)]
@@ -83,7 +83,7 @@ struct BakedResidual {
   float alpha_scale;           // m = alpha_scale * stored multiplies sigma, see AlphaTiles; 0: opaque
   const float* mean_alpha;     // [n], m of a surfel without a tile; null: 1
   float weight_bound;          // fragments of smaller weight get neither
-  float transmittance_min;     // a surfel that would leave a pixel less ends it, see blend_test; 0: never
+  float transmittance_min;     // a pixel ends where less transmittance would be left, see blend_test; 0: never
 
   template <class R> void fields(R& r, int64_t n) {
     r.numbers("offset", offset, "scale", scale);

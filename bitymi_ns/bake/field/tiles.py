@@ -51,8 +51,8 @@ def field_tiles(
     pixels_per_texel: float | None = None,
     progress: Progress = no_progress,
 ) -> BakeState:
-    """Give the surfels of a bake tiles with the values of a field at the texel centres; surfels that no view blends are
-    left out. `prune.prune_and_resample` then drops what the options say, as for trained texels.
+    """Give the surfels of a bake tiles with the values of a field at the texel centres; leave out surfels as
+    `prune.drop_unseen` does. The tiles are not reduced yet (`prune.prune_and_resample`).
 
     With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it nothing is seen: the
     field is read at the nearest point of the disc, so values stay smooth and within the range of what is seen.

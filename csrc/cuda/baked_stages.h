@@ -15,8 +15,8 @@ enum RowColumn {
   kRed = kLevelRow,        // relu(view colour + 0.5), three
   kTexelScale = kRed + 3,  // 1 / (2 extent); 0: neither residual nor alpha; -1: constants
   kLevel,                  // of the tile; the next column is unused
-  kTileX = kLevel + 2,  // centre of the tile's first texel, two; for constants the shaded colour and alpha, four
-  kSpanX = kTileX + 2,  // texels of the tile minus one, two
+  kTileX = kLevel + 2,     // centre of the tile's first texel, two; for constants the shaded colour and alpha, four
+  kSpanX = kTileX + 2,     // texels of the tile minus one, two
   kRow = kSpanX + 2
 };
 static_assert(kRow == 24 && kR2 == 12);

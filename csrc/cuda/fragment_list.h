@@ -167,8 +167,8 @@ template <int kHeld> class Stretch {
   int pairs, count;  // pairs from `first` on, and their fragments
   int64_t base;      // index of the first fragment
 
-  // Called by all threads of the block. A barrier, `find_own` and another barrier must come before the next chunk, whose
-  // warps write to `bits` immediately.
+  // Called by all threads of the block. A barrier, `find_own` and another barrier must come before the next chunk,
+  // whose warps write to `bits` immediately.
   __device__ Stretch(const Pairs& p, const TileThread& s, int64_t first, int64_t end, int (&bits)[kTileWarps][kWarp])
       : base(p.offsets[first]), bits_(bits) {
     const int64_t own = first + s.lane;  // one lane per pair

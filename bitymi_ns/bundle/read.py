@@ -179,7 +179,7 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
             raise BundleError(f"{path} is {problem}: it has {size} bytes, {entry.bytes} were written")
         if keep and name not in SCENE_FILES and size > BESIDE_LIMIT:
             raise BundleError(f"{path} has {size} bytes, at most {BESIDE_LIMIT} are read of such a file")
-        head = file.read(min(size, HEAD)) if keep or verify else b""
+        head = file.read(min(size, HEAD))
         try:
             check_head(info, name, head, size)
         except (ply.PlyError, ktx2.Ktx2Error, StreamError) as error:
@@ -187,7 +187,7 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
         if keep and name in SCENE_FILES:
             check_memory(parts.bundle, info, name)
         sha256 = hashlib.sha256() if verify else None
-        data = _read_whole(file, head, size if keep or verify else 0, keep, path, sha256)
+        data = _read_whole(file, head, size, keep, path, sha256)
     if sha256 is not None and sha256.hexdigest() != entry.sha256:
         raise BundleError(f"{path} is altered: its sha256 is not the one in {MANIFEST}")
     return data

@@ -17,10 +17,6 @@ def main(image: Path, output: Path, surfels: int = 2000, steps: int = 300, size:
     """Optimize surfels on a plane in front of the camera; return the last mean square error.
 
     Args:
-        image: picture to fit.
-        output: file for the rendered picture.
-        surfels: number of surfels.
-        steps: steps of Adam.
         size: longest side to which the picture is reduced, pixels.
     """
     photo = Image.open(image).convert("RGB")
@@ -39,7 +35,7 @@ def main(image: Path, output: Path, surfels: int = 2000, steps: int = 300, size:
         "quats": torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(surfels, 1),  # [N, 4] wxyz, facing the camera
         "log_scales": torch.full((surfels, 2), -4.0),
         "opacity_logits": torch.zeros(surfels),
-        "beta_logits": torch.zeros(surfels),
+        "beta_raw": torch.zeros(surfels),
         "colors": torch.rand(surfels, 3),
     }
     for value in parameters.values():

@@ -81,14 +81,12 @@ def read_names_of_callers() -> None:
     """Have nerfstudio's list of external methods read its callers' names without opening their source files.
 
     Changes: `inspect` in the list's namespace; it asks for the stack for each of its 26 entries. For: every ns-*
-    command. Without: half of a command's start is spent there, 5 CPU seconds. Superfluous once nerfstudio asks for the
-    one name that it reads.
+    command. Without: half of a command's start is spent there. Superfluous once nerfstudio asks for the one name that
+    it reads.
     """
-
-    def stack() -> list[SimpleNamespace]:
-        return [SimpleNamespace(function=frame.f_code.co_name) for frame in _callers(2)]
-
-    external_methods.inspect = SimpleNamespace(stack=stack)  # type: ignore[attr-defined]
+    external_methods.inspect = SimpleNamespace(  # type: ignore[attr-defined]
+        stack=lambda: [SimpleNamespace(function=frame.f_code.co_name) for frame in _callers(2)]
+    )
 
 
 def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:

@@ -39,7 +39,7 @@ from bitymi_ns.bundle import read_bundle
 from bitymi_ns.files import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
 from bitymi_ns.measure.machine import commit
-from bitymi_ns.plugin.run.metrics import lpips_metrics
+from bitymi_ns.plugin.run.metrics import LPIPS, lpips_metrics
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene import Scene
 from bitymi_ns.scene.camera import Camera
@@ -65,6 +65,7 @@ COLUMNS = {
     "refined": ("refined_psnr", 2),
     "SSIM": ("ssim", 4),
     "LPIPS": ("lpips", 4),
+    "LPIPS, VGG": ("lpips_vgg", 4),
     "before texels": ("before_texels", 2),
     "300 later": ("after_texels", 2),
     "loss, peak": ("peak", 2),
@@ -74,7 +75,7 @@ COLUMNS = {
     "fragments per pixel": ("fragments", 1),
     "CPU s": ("cpu_seconds", 0),
     "s": ("seconds", 0),
-    "card MB": ("peak_megabytes", 0),
+    "peak MB": ("peak_megabytes", 0),
     "bundle dB": ("baked_psnr", 2),
     "kB": ("kilobytes", 0),
     "bake s": ("bake_seconds", 0),
@@ -140,8 +141,27 @@ def quality(draw: Callable[[Camera], Any], views: Sequence[View], background: Te
         with torch.no_grad():
             drawn = draw(view.camera)
         rgb, target = view.shown(drawn.rgb, drawn.alpha, background), view.target(background, drawn.rgb.device)
-        rows.append(image_quality(rgb, target) | lpips_metrics(rgb.clamp(0.0, 1.0), target, ("lpips",)))
+        rows.append(image_quality(rgb, target) | lpips_metrics(rgb.clamp(0.0, 1.0), target, tuple(LPIPS)))
     return means(rows)
+
+
+def peak_megabytes(device: torch.device) -> float:
+    """Read the most memory in MB since the last `forget_peak`: a GPU's tensors, or the whole process on a CPU."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 1e6
+    return next(
+        int(line.split()[1]) * 1.024e-3
+        for line in Path("/proc/self/status").read_text().splitlines()
+        if line.startswith("VmHWM")
+    )
+
+
+def forget_peak(device: torch.device) -> None:
+    """Begin a new peak of `peak_megabytes`."""
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    else:
+        Path("/proc/self/clear_refs").write_text("5")
 
 
 class TexelWatch:
@@ -192,6 +212,7 @@ def measure(run: LongRun) -> dict[str, Any]:
     capture, device = cut(load(Path(run.data), run.reduction), run.photographs), torch.device(run.device)
     if capture.white:
         preset.train.alpha_color = "white"
+    forget_peak(device)
     torch.manual_seed(run.seed)
     scene = scene_for_views(capture.train, capture.points, capture.colours, preset.scene, preset.train, run.steps).to(
         device
@@ -209,6 +230,7 @@ def measure(run: LongRun) -> dict[str, Any]:
         trainer.advance()
         if trainer.step in shown:
             say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
+    peak = peak_megabytes(device)
     background = eval_background(preset.train, device)
     poses, exposure = trainer.training.poses, trainer.training.exposure
     held_out = [view._replace(correction=exposure.at(view.file)) for view in capture.held_out]
@@ -226,10 +248,8 @@ def measure(run: LongRun) -> dict[str, Any]:
         found |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "mean_exposure_psnr")}
     found |= texels | {"surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
     camera = capture.train[0].camera
-    found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds}
+    found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds, "peak_megabytes": peak}
     found |= {"width": camera.width, "height": camera.height}
-    if device.type == "cuda":
-        found["peak_megabytes"] = torch.cuda.max_memory_allocated(device) / 1e6
     if run.bake:
         say(f"PSNR {found['psnr']:.2f} dB, {len(scene):,} surfels; baking")
         views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]

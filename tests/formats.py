@@ -65,11 +65,11 @@ def polycam(capture: Path, corrected: bool = True) -> Path:
             here = Y_UP @ pose
             here[0, 3] += 0.0 if kind or not corrected else 0.3 * i  # the raw poses drift
             values = {f"t_{r}{c}": here[r, c] for r in range(3) for c in range(4)}
-            camera = {"fx": meta["fl_x"], "fy": meta["fl_y"], "cx": meta["cx"], "cy": meta["cy"], "width": 48}
+            camera = {"fx": meta["fl_x"], "fy": meta["fl_y"], "cx": meta["cx"], "cy": meta["cy"], "width": meta["w"]}
             put(file, folder / f"keyframes/{kind}images/{i}.png")
             place = folder / f"keyframes/{kind}cameras/{i}.json"
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_text(json.dumps({**values, **camera, "height": 36, "blur_score": 1.0}))
+            place.write_text(json.dumps({**values, **camera, "height": meta["h"], "blur_score": 1.0}))
             put_depth(folder / f"keyframes/depth/{i}.png")
     put(frames[0][0], folder / "thumbnail.png")
     return folder
@@ -88,7 +88,9 @@ def record3d(capture: Path) -> Path:
         put(file, folder / f"rgb/{i}.png")
         put_depth(folder / f"depth/{i}.png")
     K = [2 * meta["fl_x"], 0, 0, 0, 2 * meta["fl_y"], 0, 2 * meta["cx"], 2 * meta["cy"], 1]
-    (folder / "metadata").write_text(json.dumps({"K": K, "w": 96, "h": 72, "poses": poses, "fps": 60}))
+    (folder / "metadata").write_text(
+        json.dumps({"K": K, "w": 2 * meta["w"], "h": 2 * meta["h"], "poses": poses, "fps": 60})
+    )
     return folder
 
 
@@ -137,7 +139,7 @@ def stray_scanner(capture: Path, rows: int = 12) -> Path:
     frames, meta, folder = room_of(capture)
     with av.open(str(folder / "rgb.mp4"), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
-        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = 48, 36, "yuv420p", 8_000_000
+        stream.width, stream.height, stream.pix_fmt, stream.bit_rate = meta["w"], meta["h"], "yuv420p", 8_000_000
         for file, _ in frames:
             container.mux(stream.encode(av.VideoFrame.from_image(Image.open(file).convert("RGB"))))
         container.mux(stream.encode())

@@ -1,5 +1,4 @@
-"""Point clouds: validate and read PLY files, color points by photographs, and project them to detect poses in another
-convention.
+"""Point clouds: validate and read PLY files, and color points by photographs.
 
 nerfstudio's PLY reader returns uninitialized memory for missing points, and divides all colors by 255, even those in
 [0, 1].
@@ -7,9 +6,8 @@ nerfstudio's PLY reader returns uninitialized memory for missing points, and div
 
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -17,10 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.image_files import read_image
-from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, fail, say, warn
+from bitymi_ns.capture.types import Photograph, fail, say
 from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lines
 from bitymi_ns.ranges import spread
 
@@ -31,16 +28,6 @@ MANY_POINTS = 500_000  # points from which on slow steps are announced and timed
 COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
 COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
-CHECK_VIEWS = 8  # photographs, spread over all, into which points are projected to check conventions
-CHECK_POINTS = 2000
-CHECK_SIZE = 800  # least longer side that JPEG files are decoded at for that check, pixels
-NOTHING, SOMETHING = 0.01, 0.1
-"""Shares of the points that project into pictures: below the first by wrong poses, above the second by right ones."""
-MANY_TIMES, MORE_ALIKE = 2.5, 0.05
-"""Least ratio of these shares, and least difference in the correlation of brightness, of right poses to wrong ones. In
-three real captures, right poses show 70 to 76 % of the points with a correlation of 0.21 to 0.56, others at most 24 %
-with 0.12."""
-ALIKE = 0.4  # least correlation, and difference in it, that suffice alone: a room has points on all sides
 
 
 class Points(NamedTuple):
@@ -200,85 +187,3 @@ def sample_colors(
     x, y = pixels[inside].astype(int).T
     colors[front[inside]] = image[y, x]
     return colors
-
-
-Conventions = dict[str, Callable[[Pose], Pose]]
-
-
-def _from_xyzw(pose: Pose) -> Pose:
-    """Convert a COLMAP pose whose quaternion x, y, z, w was read as w, x, y, z."""
-    read = np.linalg.inv(pose @ OPENCV_AXES)
-    meant = np.eye(4)  # SciPy's order is x, y, z, w
-    meant[:3, :3] = Rotation.from_quat(Rotation.from_matrix(read[:3, :3]).as_quat()[[3, 0, 1, 2]]).as_matrix()
-    meant[:3, 3] = read[:3, 3]
-    return np.linalg.inv(meant) @ OPENCV_AXES
-
-
-JSON_POSES: Conventions = {
-    "the cameras have OpenCV's axes (y down, z forward): negate the second and third column": lambda c: c @ OPENCV_AXES,
-    "they are world to camera: invert them": np.linalg.inv,
-    "they are world to camera with OpenCV's axes: invert them, then negate the second and third column": lambda c: (
-        np.linalg.inv(c) @ OPENCV_AXES
-    ),
-    "they are left-handed, as Unity's: negate the third column": lambda c: c @ np.diag([1.0, 1.0, -1.0, 1.0]),
-}
-"""Conversions of poses in a transforms.json that was written in another convention than camera to world with OpenGL
-axes, by the remedy."""
-COLMAP_POSES: Conventions = {
-    "the cameras have OpenGL's axes (y up, z backward)": lambda pose: pose @ OPENCV_AXES,
-    "they are camera to world: invert them": lambda pose: OPENCV_AXES @ np.linalg.inv(pose) @ OPENCV_AXES,
-    "they are camera to world with OpenGL's axes": lambda pose: OPENCV_AXES @ np.linalg.inv(pose),
-    "the quaternions are in the order x, y, z, w: write w first": _from_xyzw,
-}
-"""Conversions of poses of COLMAP models, which should be world to camera with OpenCV axes, by the remedy."""
-
-
-class _Fit(NamedTuple):
-    """Share of points that project into pictures; correlation of their brightness with the pixels', 0 if unknown."""
-
-    share: float
-    correlation: float
-
-
-def check_conventions(
-    points: Points, photographs: Sequence[Photograph], conventions: Conventions, source: str, frame: Pose | None = None
-) -> None:
-    """Warn if the photographs do not show the points by their poses, but would by another of the `conventions`. `frame`
-    [4, 4] leads from the poses' frame to that of points and photographs; None = the same."""
-    rgb = points.rgb if len(points.rgb) == len(points.xyz) else np.zeros((len(points.xyz), 3), np.uint8)
-    kept = np.flatnonzero(np.isfinite(points.xyz).all(1))
-    kept = kept[:: max(1, len(kept) // CHECK_POINTS)]
-    if len(kept) < 20:
-        return
-    back = np.eye(4) if frame is None else np.linalg.inv(frame)
-    xyz = points.xyz[kept] @ back[:3, :3].T + back[:3, 3]
-    chosen = [photographs[i] for i in spread(len(photographs), CHECK_VIEWS)]
-    images = []
-    for each in chosen:
-        scale = CHECK_SIZE / max(each.camera.size)
-        wanted = (round(each.camera.width * scale), round(each.camera.height * scale))
-        images.append(np.asarray(read_image(each.file, wanted=wanted).convert("RGB")))
-
-    def fit(convention: Callable[[Pose], Pose]) -> _Fit:
-        cameras = [replace(each, pose=convention(back @ each.pose)) for each in chosen]
-        seen = np.stack([sample_colors(xyz, *each) for each in zip(cameras, images, strict=True)])
-        inside = np.isfinite(seen[..., 0])
-        share = float(inside.mean())
-        own = np.broadcast_to(rgb[kept].astype(float).mean(-1), inside.shape)[inside]
-        theirs = seen.mean(-1)[inside]
-        if len(own) < 20 or own.std() < 1.0 or theirs.std() < 1.0:
-            return _Fit(share, 0.0)
-        return _Fit(share, float(np.corrcoef(own, theirs)[0, 1]))
-
-    read = fit(lambda pose: pose)
-    fits = {name: fit(convention) for name, convention in conventions.items()}
-    best = max(fits, key=lambda name: fits[name].share * max(fits[name].correlation, NOTHING))
-    better = fits[best].correlation - read.correlation
-    unseen = read.share < NOTHING and fits[best].share > SOMETHING
-    rare = fits[best].share > max(SOMETHING, MANY_TIMES * read.share) and better > MORE_ALIKE
-    if unseen or rare or (fits[best].share > NOTHING and fits[best].correlation > ALIKE and better > ALIKE):
-        what = "are in next to none of the photographs" if unseen else "do not look like the photographs in their place"
-        warn(
-            f"{source}: by its poses its points {what}; they would if the poses were written in another convention: "
-            f"{best}. As they are, the scene will be wrong."
-        )

@@ -14,10 +14,11 @@ from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_p
 from bitymi_ns.capture.find_files import check_photographs_exist, name_unused
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.masks import check_masks, with_masks
-from bitymi_ns.capture.points import COLMAP_POSES, JSON_POSES, Points, check_conventions, read_cloud, with_colors
+from bitymi_ns.capture.points import Points, read_cloud, with_colors
 from bitymi_ns.capture.pose_checks import fit_scale
+from bitymi_ns.capture.readings import AUTO, Convention, as_meant
 from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
-from bitymi_ns.capture.scanner_views import scanner_photographs
+from bitymi_ns.capture.scanner_views import Y_UP, scanner_photographs
 from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, read_split_lists
 from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
@@ -39,8 +40,15 @@ OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "scale_factor": (*FRAMED, "blender"),
     "eval_names": ("nerfstudio", "instant-ngp", *WITH_MODEL, *SCANNED),
     "sfm": ("photographs", "video"),
+    "poses_as": ("nerfstudio", "instant-ngp", "blender", "colmap", *SCANNED),
 }
 """Formats of options that are not for all formats."""
+CONVENTIONS: dict[str, Convention] = {
+    "colmap": Convention("opencv", "w2c", "wxyz", TO_Z_UP), "polycam": Convention(frame=Y_UP),
+    "record3d": Convention(order="xyzw", frame=Y_UP), "3d-scanner": Convention(frame=Y_UP),
+    "stray-scanner": Convention("opencv", "c2w", "xyzw", Y_UP), "pose-files": Convention("opencv"),
+}  # fmt: skip
+"""Conventions of formats; of others camera to world with OpenGL axes."""
 NGP_SCALE = 0.3333  # factor on positions of instant-ngp's captures, as in nerfstudio's reader
 BLENDER_SIDE = 1.5  # half the side of a Blender data set's box, as in nerfstudio's reader
 
@@ -67,6 +75,9 @@ class CaptureOptions(SplitOptions, FrameOptions):
     random ones."""
     sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
     """Structure from motion for photographs and videos."""
+    poses_as: str = AUTO
+    """How to read the poses: as the photographs show (auto), as the file states (written), or by the name of a reading
+    that a message states."""
     poses: Path | None = None  # Folder of the poses that a run was trained with.
 
     def find(self) -> Found:
@@ -114,6 +125,7 @@ class Capture:
     downscale: int = 1  # factor by which photographs are reduced
     applied: Pose | None = None  # transform [4, 4] that its files state as applied, with a scale
     applied_scale: float = 1.0
+    poses_as: str = AUTO  # name of the reading of its poses
     report: Path | None = None  # folder of the report on structure from motion; None = none
     model: Source | None = None  # found by structure from motion; None = the capture came with poses
 
@@ -137,6 +149,8 @@ class _Reader:
     found: Found
     need_photos: bool
     want_points: bool
+    poses_as: str = AUTO
+    mirror: Pose | None = None  # reflection [4, 4] of the world if that is left-handed
 
     def read(self) -> Capture:
         found = self.found
@@ -148,6 +162,7 @@ class _Reader:
             )
         readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
         capture = {**readers, "blender": self._blender}.get(found.format, self._transforms)()
+        capture.poses_as = self.poses_as
         if capture.report is None and read_frame(found.folder) is not None:
             capture.report = found.folder
         there = [name for name in ("val", "test") if capture.parts.get(name)]
@@ -177,6 +192,16 @@ class _Reader:
             check_photographs_exist(read.path, [each.file for each in read.photographs])
         photographs, source = read.photographs, str(found.path)
         meta, frame = read.meta, options
+        earlier = found.folder / "colmap/sparse/0"  # points of nerfstudio's tool before it stated either
+        applied, own = meta.get("applied_transform"), None
+        if applied is None and earlier.is_dir():
+            applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+        what, auto = f"{source} ({found.format}, {len(photographs)} photographs)", options.points == "auto"
+        model = read_model(earlier) if auto and "ply_file_path" not in meta and is_model(earlier) else None
+        if model is not None:
+            what += f", points of {earlier}"
+        self._check(what, photographs, read.named)
+        photographs = self._as_meant(photographs, source)
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * check_number(read.path, "aabb_scale", meta.get("aabb_scale", 1), "for all frames")
             if not 0.0 < half < math.inf:
@@ -189,22 +214,11 @@ class _Reader:
                 fail(f"{read.path}: orientation_override is {meta['orientation_override']!r}, none of {allowed}.")
             frame = replace(frame, orientation_method=meta["orientation_override"])
             say(f"{read.path} asks for the orientation method {frame.orientation_method}.")
-        earlier = found.folder / "colmap/sparse/0"  # points of nerfstudio's tool before it stated either
-        applied, own = meta.get("applied_transform"), None
-        if applied is None and earlier.is_dir():
-            applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-        what, auto = f"{source} ({found.format}, {len(photographs)} photographs)", options.points == "auto"
-        model = read_model(earlier) if auto and "ply_file_path" not in meta and is_model(earlier) else None
-        if model is not None:
-            what += f", points of {earlier}"
-        self._check(what, photographs, read.named)
         if auto and "ply_file_path" in meta:
             hint = f"Put it there again, or remove ply_file_path from {read.path} to start from random points."
             own = self._cloud(found.folder / meta["ply_file_path"], hint, photographs)
         elif model is not None:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
-        if own is not None and self.need_photos and self.want_points:
-            check_conventions(own, photographs, JSON_POSES, source)
         scale = float(meta.get("applied_scale", 1.0))
         points = self._points(own, photographs, source)
         return Capture(found.format, source, photographs, points, frame, read.lists, {}, self.downscale, applied, scale)
@@ -220,10 +234,11 @@ class _Reader:
         photographs, where = photographs_of(source, need_photos), str(source.folder)
         masked = {*named, *(each.mask for each in photographs)} if found.format == "colmap" else None
         self._check(source.describe(), photographs, masked)
+        if found.format == "colmap":
+            photographs = self._as_meant(photographs, where)
         own = model_points(model, TO_Z_UP)
         if need_photos and self.want_points and options.points == "auto":
             own = self._colored(own, model.without_colors, photographs, source.folder)
-            check_conventions(own, photographs, COLMAP_POSES, where, TO_Z_UP)
         points, lists = self._points(own, photographs, where), read_split_lists(found.folder)
         return Capture(
             found.format, where, photographs, points, options, lists, {}, source.downscale, TO_Z_UP,
@@ -238,6 +253,7 @@ class _Reader:
             photographs = with_masks(photographs, found.folder)
         named = {file for each in photographs for file in (each.file, each.mask)}
         self._check(f"{source} ({found.format}, {len(photographs)} photographs with their poses)", photographs, named)
+        photographs = self._as_meant(photographs, source)
         points = self._points(None, photographs, source)
         return Capture(found.format, source, photographs, points, self.options, downscale=self.downscale)
 
@@ -261,18 +277,20 @@ class _Reader:
                 named |= part.named
         source, every = str(train.path), [each for part in parts.values() for each in part]
         self._check(f"{train.path} (blender, {len(train.photographs)} photographs)", every, named)
-        own = None
-        if options.ply_path is not None and options.points == "auto":
-            hint = "Put it there again, or leave --ply-path out to start from random points."
-            own = self._cloud(found.path / options.ply_path, hint, train.photographs)
-        frame = FrameOptions(options.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
-        if options.scale_factor == 1.0:  # else the user has chosen it
-            frame = fit_scale(frame, train.photographs, source)
+        every = self._as_meant(every, source)
         numbers, start = {}, 0
         for name, part in parts.items():
             numbers[name] = range(start, start + len(part))
             start += len(part)
-        points = self._points(own, train.photographs, source)
+        used = every[: len(train.photographs)]
+        own = None
+        if options.ply_path is not None and options.points == "auto":
+            hint = "Put it there again, or leave --ply-path out to start from random points."
+            own = self._cloud(found.path / options.ply_path, hint, used)
+        frame = FrameOptions(options.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
+        if options.scale_factor == 1.0:  # else the user has chosen it
+            frame = fit_scale(frame, used, source)
+        points = self._points(own, used, source)
         return Capture(found.format, source, every, points, frame, parts=numbers, downscale=self.downscale)
 
     def _check(self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None] | None) -> None:
@@ -286,11 +304,21 @@ class _Reader:
             if named is not None:
                 name_unused(self.found.folder, named, self.options.downscale_factor)
 
+    def _as_meant(self, photographs: Sequence[Photograph], source: str) -> list[Photograph]:
+        """Give photographs the poses that they are meant to have; see `as_meant`."""
+        convention = CONVENTIONS.get(self.found.format, Convention())
+        meant, self.mirror, self.poses_as = as_meant(
+            photographs, convention, source, self.options.poses_as, self.need_photos
+        )
+        return meant
+
     def _cloud(self, path: Path, remedy: str, photographs: Sequence[Photograph]) -> Points:
         points, reason = read_cloud(path, remedy)
         return self._colored(points, reason, photographs, path)
 
     def _colored(self, points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
+        if self.mirror is not None:
+            points = points._replace(xyz=points.xyz @ self.mirror[:3, :3].T + self.mirror[:3, 3])
         return with_colors(points, without, photographs, source) if self.want_points else points
 
     def _points(self, own: Points | None, photographs: Sequence[Photograph], source: str) -> Points | None:

@@ -63,12 +63,15 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 
 @as_input_error()
-def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains: bool = True) -> None:
+def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains: bool = True) -> str | None:
     """Check that there is a capture at the data manager's path, and replace its parser by that of `bitymi_parser`.
 
     Args:
         read: also read the views, silently, if the capture comes with poses.
         trains: the command has an option for the path, --data.
+
+    Returns:
+        how the capture's poses are read, if they were.
 
     Raises:
         InputError: there is none, or an option is out of range.
@@ -93,10 +96,13 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains
             quiet, CONSOLE.quiet = CONSOLE.quiet, True
             try:
                 with reporting_input_errors(config):
-                    dataparser.setup().get_dataparser_outputs("train")
+                    parser = dataparser.setup()
+                    parser.get_dataparser_outputs("train")
+                    return str(parser.poses_as)
             finally:
                 CONSOLE.quiet = quiet
                 forget_model()
+    return None
 
 
 def declares_box(dataparser: DataParserConfig) -> bool:

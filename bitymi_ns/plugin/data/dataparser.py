@@ -22,6 +22,7 @@ from bitymi_ns.capture import splits
 from bitymi_ns.capture.colmap_views import Source
 from bitymi_ns.capture.lens import Pinhole
 from bitymi_ns.capture.read import CaptureOptions, read_capture
+from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.types import OPENCV_AXES
 from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.depth import DepthKind
@@ -58,6 +59,10 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
     poses: tyro.conf.Suppress[Path | None] = None
     """Folder of the poses that a run was trained with; set where its data are read."""
 
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Load a config.yml; one without poses_as is of a run that took the poses as written."""
+        self.__dict__ |= {"poses_as": WRITTEN, **state}
+
     @as_input_error()
     def resolve_names(self) -> None:
         """Replace a file in `eval_names` by the names that it holds, so that config.yml needs no other file."""
@@ -75,6 +80,7 @@ class BitymiDataParser(DataParser):
         # after reading: report on structure from motion, and its model; None = the capture came with poses
         self.poses_report: Path | None = None
         self.sfm_source: Source | None = None
+        self.poses_as = config.poses_as  # after reading: how the poses were read
 
     @cached_property
     @as_input_error()
@@ -82,7 +88,7 @@ class BitymiDataParser(DataParser):
         """Outputs by split: train, val, test; read once."""
         need_photos, color = self.downscale_factor is None, self.config.alpha_color
         capture = read_capture(self.config, need_photos, _want_points.get())
-        self.poses_report, self.sfm_source = capture.report, capture.model
+        self.poses_report, self.sfm_source, self.poses_as = capture.report, capture.model, capture.poses_as
         views = make_views(capture, need_photos)
         if capture.format == "blender" and color is not None:
             views.alpha_color = get_color(color)

@@ -1,6 +1,8 @@
 """Make nerfstudio configurations of the registered methods from presets."""
 
+import copy
 import os
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,6 +15,7 @@ from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
+from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.files import write_errors_as, write_file
 from bitymi_ns.plugin import hooks
@@ -126,13 +129,17 @@ class BitymiTrainerConfig(TrainerConfig):
         """Check capture and output folder, write config.yml, the run's first file, and print a summary."""
         if not torchrun.own().first:
             return
-        check_capture(self.pipeline.datamanager, read=True)
+        poses_as = check_capture(self.pipeline.datamanager, read=True)
+        recorded = self
+        if poses_as is not None:
+            recorded = copy.deepcopy(self)
+            recorded.pipeline.datamanager.dataparser.poses_as = poses_as
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
             run_folder.check_unused(folder, self.get_checkpoint_dir())
         run_folder.take(folder)
         with write_errors_as(folder, InputError, " (--output-dir)."):
-            write_file(folder / "config.yml", yaml.dump(self).encode("utf8"))
+            write_file(folder / "config.yml", yaml.dump(recorded).encode("utf8"))
         # what follows in nerfstudio would start the processes its own way, see `torchrun`
         self.machine = replace(self.machine, num_machines=1, num_devices=1)
         say(self.summary())
@@ -184,14 +191,18 @@ class BitymiTrainerConfig(TrainerConfig):
 
     @as_input_error()
     def _take_poses_of_resumed(self) -> None:
-        """Make a resumed run use the resumed one's poses; a new run finds its own."""
+        """Make a resumed run use the resumed one's poses, read as it read them; a new run finds its own."""
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
-            self.take_poses_of(Path(os.path.expanduser(checkpoints_of)).absolute().parent)
+            run = Path(os.path.expanduser(checkpoints_of)).absolute().parent
+            self.take_poses_of(run)
             dataparser = self.pipeline.datamanager.dataparser
             poses = getattr(dataparser, "poses", None)
             if poses is not None and has_kept_poses(Path(poses)):
                 dataparser.sfm = kept_settings(Path(poses), dataparser.sfm)
+            elif isinstance(dataparser, BitymiDataParserConfig) and (run / "config.yml").is_file():
+                stated = re.search(r"^ *poses_as: (\S+)$", (run / "config.yml").read_text("utf8"), re.M)
+                dataparser.poses_as = WRITTEN if stated is None else stated[1]
         elif isinstance(self.pipeline.datamanager.dataparser, BitymiDataParserConfig):
             self.pipeline.datamanager.dataparser.poses = None
 

@@ -1,88 +1,153 @@
-"""Poses in another convention than their file's, detected by the capture's points."""
+"""Poses of every format in another convention than the file's are read as meant, as the photographs show."""
 
+import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.capture import readings
 from bitymi_ns.capture.points import read_points
-from tests.captures import edit_frames, load_any, printed, write_cloud
-from tests.formats import colmap
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from tests.captures import edit, edit_frames, load_any, printed
+from tests.formats import PHOTOGRAPHS, SCANS, colmap, scannet, stray_scanner
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
+QUARTER = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 Pose = np.ndarray
-WRONG = "As they are, the scene will be wrong."
+Change = Callable[[Pose], Pose]
+
+
+@pytest.fixture(scope="session")
+def large_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The room at a size at which photographs can be matched. Not to be changed."""
+    from bitymi_ns.sample import generate
+
+    return generate(tmp_path_factory.mktemp("large") / "room", views=12, width=320, height=240, seed=0, points=200)
 
 
 @pytest.fixture
-def model(capture: Path) -> Path:
-    """images.txt of the room as a COLMAP model with 200 points."""
-    points = read_points(capture / "sparse_pc.ply")[0]
-    folder = colmap(capture)
-    rows = [" ".join(map(str, [i, *xyz, *rgb, 0.5])) for i, (xyz, rgb) in enumerate(zip(*points, strict=True), 1)]
-    (folder / "points3D.txt").write_text("\n".join(rows))
-    return folder / "images.txt"
+def capture(large_room: Path, tmp_path: Path) -> Path:
+    readings._decided.clear()
+    return Path(shutil.copytree(large_room, tmp_path / "room"))
 
 
-@pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        (lambda pose: pose @ FLIP, "the cameras have OpenCV's axes"),
-        (np.linalg.inv, "they are world to camera: invert them."),
-        (lambda pose: np.linalg.inv(pose @ FLIP), "they are world to camera with OpenCV's axes"),
-        (lambda pose: pose @ np.diag([1.0, 1.0, -1.0, 1.0]), "they are left-handed, as Unity's"),
-    ],
-)
-def test_of_a_transforms_json(
-    capture: Path, written: Callable[[Pose], Pose], message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    edit_frames(capture, lambda f: f.update(transform_matrix=written(np.array(f["transform_matrix"])).tolist()))
-    load_any(capture)
-    text = printed(capsys)
-    assert f"another convention: {message}" in text and WRONG in text
+def decided() -> str:
+    """Return the reading that matches decided, of which there were enough."""
+    (decision,) = readings._decided.values()
+    assert decision.reading is not None and decision.share > 0.5
+    return decision.reading.name
 
 
-@pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        (lambda w2c: FLIP @ w2c, "the cameras have OpenGL's axes"),
-        (np.linalg.inv, "they are camera to world: invert them."),
-        (lambda w2c: np.linalg.inv(FLIP @ w2c), "they are camera to world with OpenGL's axes"),
-        (None, "the quaternions are in the order x, y, z, w"),
-    ],
-)
-def test_of_a_colmap_model(
-    model: Path, written: Callable[[Pose], Pose] | None, message: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    lines = []
-    for line in filter(None, model.read_text().splitlines()):
+def of_json(capture: Path, change: Change) -> Path:
+    edit_frames(capture, lambda f: f.update(transform_matrix=change(np.array(f["transform_matrix"])).tolist()))
+    return capture
+
+
+def of_model(capture: Path, change: Change, order: str = "wxyz") -> Path:
+    """Change the poses, world to camera, of the room as a COLMAP model, and write quaternions in an order."""
+    path, lines = colmap(capture) / "images.txt", []
+    for line in filter(None, path.read_text().splitlines()):
         number, *pose, camera, name = line.split()
-        pose = list(map(float, pose))
-        if written is None:
-            pose[:4] = [*pose[1:4], pose[0]]
-        else:
-            w2c = np.eye(4)
-            w2c[:3, :3], w2c[:3, 3] = Rotation.from_quat([*pose[1:4], pose[0]]).as_matrix(), pose[4:]
-            other = written(w2c)
-            x, y, z, w = Rotation.from_matrix(other[:3, :3]).as_quat()
-            pose = [w, x, y, z, *other[:3, 3]]
-        lines.append(f"{' '.join(map(str, [number, *pose, camera, name]))}\n\n")
-    model.write_text("".join(lines))
-    load_any(model.parents[2])
+        w2c = np.eye(4)
+        w2c[:3, :3], w2c[:3, 3] = Rotation.from_quat([*map(float, [*pose[1:4], pose[0]])]).as_matrix(), pose[4:]
+        other = change(w2c)
+        numbers = dict(zip("xyzw", Rotation.from_matrix(other[:3, :3]).as_quat(), strict=True))
+        written = [*(numbers[letter] for letter in order), *other[:3, 3]]
+        lines.append(f"{' '.join(map(str, [number, *written, camera, name]))}\n\n")
+    path.write_text("".join(lines))
+    return capture
+
+
+def of_scan(capture: Path, change: Change) -> Path:
+    folder = scannet(capture)
+    for path in (folder / "pose").iterdir():
+        np.savetxt(path, change(np.loadtxt(path)))
+    return folder
+
+
+@pytest.mark.parametrize("form", [*PHOTOGRAPHS, *SCANS, stray_scanner])
+def test_right_ones_are_nothing_to_speak_of(
+    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = form(capture)
+    load_any(capture if place.is_relative_to(capture) else place)
     text = printed(capsys)
-    assert f"another convention: {message}" in text and WRONG in text
+    assert decided() == "written" and "poses are read as" not in text and "contradict" not in text
 
 
-@pytest.mark.parametrize("colours", [True, False])
-def test_right_ones_are_nothing_to_speak_of(capture: Path, colours: bool, capsys: pytest.CaptureFixture[str]) -> None:
-    if not colours:
-        write_cloud(capture / "sparse_pc.ply", read_points(capture / "sparse_pc.ply")[0].xyz, None)
+@pytest.mark.parametrize(
+    ("write", "name", "words"),
+    [
+        (lambda c: of_json(c, lambda pose: pose @ FLIP), "opencv", "in OpenCV's camera axes (y down, z forward)"),
+        (lambda c: of_json(c, np.linalg.inv), "w2c", "world to camera"),
+        (lambda c: of_json(c, lambda pose: np.linalg.inv(pose @ FLIP)), "opencv-w2c", "z forward), world to camera"),
+        (lambda c: of_json(c, lambda pose: pose @ MIRROR), "left-handed", "left-handed, as Unity's"),
+        (lambda c: of_json(c, lambda pose: pose @ QUARTER), "turn270", "turned by 270 degrees about the optical axis"),
+        (lambda c: of_model(c, lambda w2c: FLIP @ w2c), "opengl", "in OpenGL's camera axes (y up, z backward)"),
+        (lambda c: of_model(c, np.linalg.inv), "c2w", "camera to world"),
+        (lambda c: of_model(c, np.linalg.inv, "xyzw"), "c2w-xyzw",
+         "camera to world, with quaternions in the order x, y, z, w"),
+        (lambda c: of_scan(c, lambda pose: pose @ FLIP), "opengl", "in OpenGL's camera axes (y up, z backward)"),
+    ],
+)  # fmt: skip
+def test_others_are_read_as_meant(
+    capture: Path, write: Callable[[Path], Path], name: str, words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right = load_any(capture).train_dataset.cameras.camera_to_worlds
+    readings._decided.clear()
+    data = write(capture)
+    manager = load_any(data)
+    text = printed(capsys)
+    assert decided() == name
+    assert re.search(rf"the poses are read as [^:]*{re.escape(words)}: that explains \d\d% .*, as written \d+%", text)
+    assert "`bitymi-data --poses-as written`" in text and f"this reading is `{name}`" in text
+    found = manager.train_dataset.cameras.camera_to_worlds
+    np.testing.assert_allclose(relative(found), relative(right), atol=1e-3)
+    again = load_any(data, poses_as=name).train_dataset.cameras.camera_to_worlds
+    assert (again == found).all() and "poses are read as" not in printed(capsys)
+
+
+def relative(poses: Any) -> Any:
+    """Compute the positions in the first camera's frame, over the distance of the second one."""
+    first, places = poses[0, :, :3].double().numpy(), poses[:, :, 3].double().numpy()
+    local = (places - places[0]) @ first
+    return local / np.linalg.norm(local[1])
+
+
+def test_a_left_handed_world_is_mirrored_with_its_cloud(capture: Path) -> None:
+    right = load_any(capture).train_dataparser_outputs
+    readings._decided.clear()
+    of_json(capture, lambda pose: MIRROR @ pose @ MIRROR)
+    cloud = capture / "sparse_pc.ply"
+    from bitymi_ns.ply import write_cloud
+
+    points = read_points(cloud)[0]
+    write_cloud(cloud, points.xyz * (1, 1, -1), points.rgb)
+    found = load_any(capture).train_dataparser_outputs
+    assert decided() == "left-handed"
+    np.testing.assert_allclose(found.metadata["points3D_xyz"], right.metadata["points3D_xyz"], atol=1e-5)
+    np.testing.assert_allclose(found.cameras.camera_to_worlds, right.cameras.camera_to_worlds, atol=1e-5)
+
+
+def test_cameras_at_one_place_as_written(capture: Path) -> None:
+    """Poses of a turntable, read in the wrong direction, put all cameras at one place: no reason to stop."""
+    edit(capture, lambda meta: meta.pop("ply_file_path"))
+    of_json(capture, lambda pose: np.linalg.inv(pose))
     load_any(capture)
-    assert "convention" not in printed(capsys)
+    assert decided() == "w2c"
 
 
-def test_right_ones_of_a_colmap_model(model: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    load_any(model.parents[2])
-    assert "convention" not in printed(capsys)
+def test_recorded_options(tmp_path: Path) -> None:
+    """A config.yml from before keeps the poses as written; a new one keeps what it says."""
+    now = yaml.dump(BitymiDataParserConfig(poses_as="opencv"))
+    assert yaml.load(now, yaml.UnsafeLoader).poses_as == "opencv"
+    before = "".join(line for line in now.splitlines(True) if not line.startswith("poses_as"))
+    assert yaml.load(before, yaml.UnsafeLoader).poses_as == "written"
+    assert BitymiDataParserConfig().poses_as == "auto"

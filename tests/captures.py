@@ -106,11 +106,10 @@ def found_poses(model: Path, images: Path, report: Path, **changes: Any) -> Foun
 def colmap_model(capture: Path, folder: Path, scale: float = 1.0) -> None:
     """Write the capture's views as a COLMAP text model; the fourth quaternion has length `scale`."""
     folder.mkdir(parents=True)
-    meta = json.loads((capture / "transforms.json").read_text())
-    camera = (meta["w"], meta["h"], *(round(meta[key], 3) for key in ("fl_x", "fl_y", "cx", "cy")))
-    (folder / "cameras.txt").write_text(f"1 PINHOLE {' '.join(f'{value:g}' for value in camera)}\n")
+    (folder / "cameras.txt").write_text("1 PINHOLE 48 36 40 40 24 18\n")
     lines = []
-    for i, frame in enumerate(meta["frames"]):
+    frames = json.loads((capture / "transforms.json").read_text())["frames"]
+    for i, frame in enumerate(frames):
         w2c = np.linalg.inv(np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1]))
         quaternion = Rotation.from_matrix(w2c[:3, :3]).as_quat()[[3, 0, 1, 2]] * (scale if i == 3 else 1.0)
         numbers = " ".join(map(str, [i + 1, *quaternion, *w2c[:3, 3], 1]))

@@ -17,15 +17,16 @@ AUTO, WRITTEN = "auto", "written"
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 CAMERA_AXES = {"opengl": np.eye(4), "opencv": OPENCV_AXES, "left-handed": MIRROR}
 TURNS = {"turn90": 90, "turn180": 180, "turn270": 270}
-INTRINSICS = {f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)}
-SWAPPED = "swapped-intrinsics"
+SWAPPED, NO_DISTORTION = "swapped-intrinsics", "no-distortion"
+INTRINSICS = {**{f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)}, SWAPPED: 1.0}
+"""Factors on focal lengths and principal points."""
 WORDS = {
     "opengl": "in OpenGL's camera axes (y up, z backward)", "opencv": "in OpenCV's camera axes (y down, z forward)",
     "left-handed": "left-handed, as Unity's", "c2w": "camera to world", "w2c": "world to camera",
     "wxyz": "with quaternions in the order w, x, y, z", "xyzw": "with quaternions in the order x, y, z, w",
     **{name: f"turned by {angle} degrees about the optical axis" for name, angle in TURNS.items()},
-    **{name: f"with intrinsics for pictures {1 / factor:g} times as large" for name, factor in INTRINSICS.items()},
-    SWAPPED: "with intrinsics for pictures whose sides are swapped",
+    **{name: f"with the intrinsics times {factor:g}" for name, factor in INTRINSICS.items()},
+    SWAPPED: "with the intrinsics of pictures whose sides are swapped", NO_DISTORTION: "without lens distortion",
 }  # fmt: skip
 """Parts of the names of readings, and what they say of poses."""
 ENOUGH = 100  # matches that decide
@@ -33,7 +34,6 @@ FITS = 0.5  # least share of the matches that poses explain, relative to what th
 LEAD = 2.0
 """Least ratio of what a reading explains to what the poses explain as written; in captures that are right as written it
 is at most 0.4, in others at least 7."""
-WORST = 0.1  # share relative to the pairs' own below which a photograph is named
 
 
 class Convention(NamedTuple):
@@ -68,7 +68,9 @@ def readings(convention: Convention) -> dict[str, Reading]:
 
     orders = others(convention.order, "wxyz", "xyzw") if convention.order else [""]
     axes = others(convention.axes, "opengl", "opencv", "left-handed")
-    every = product(axes, others(convention.direction, "c2w", "w2c"), orders, ["", *TURNS], ["", *INTRINSICS, SWAPPED])
+    every = product(
+        axes, others(convention.direction, "c2w", "w2c"), orders, ["", *TURNS], ["", *INTRINSICS, NO_DISTORTION]
+    )
     found = sorted((Reading(*each) for each in every), key=lambda each: sum(map(bool, each)))
     return {each.name: each for each in found}
 
@@ -95,16 +97,17 @@ def read_as(poses: Pose, convention: Convention, reading: Reading) -> tuple[Pose
 
 
 def camera_as(camera: ColmapCamera, reading: Reading) -> ColmapCamera:
-    """Convert a camera by a reading."""
+    """Convert a camera by a reading; one of 360-degree pictures has nothing to convert."""
     if not reading.intrinsics or camera.model == SPHERICAL_MODEL:
         return camera
-    if factor := INTRINSICS.get(reading.intrinsics):
-        scaled = camera.colmap
-        scaled.rescale(factor)
-        return camera._replace(params=tuple(scaled.params))
-    params = np.array(camera.params)
-    for indices in (camera.colmap.focal_length_idxs(), camera.colmap.principal_point_idxs()):
-        params[list(indices)] = params[list(indices)][::-1]
+    lens, params = camera.colmap, np.array(camera.params)
+    if reading.intrinsics == NO_DISTORTION:
+        return camera._replace(
+            model="PINHOLE", params=(*lens.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(),)
+        )
+    for indices in map(list, (lens.focal_length_idxs(), lens.principal_point_idxs())):
+        order = -1 if reading.intrinsics == SWAPPED else 1
+        params[indices] = params[indices][::order] * INTRINSICS[reading.intrinsics]
     return camera._replace(params=tuple(params.tolist()))
 
 
@@ -112,65 +115,43 @@ class Decision(NamedTuple):
     """Reading that the photographs ask for; None = none explains them."""
 
     reading: Reading | None
-    share: float = 0.0  # of the matches that it explains
+    share: float = 0.0  # of the matches that it explains, or that which explains most
     written: float = 0.0  # share as written
     own: float = 0.0  # share by the pairs' own poses
-    worst: tuple[str, ...] = ()  # photographs whose pairs are explained least
-    undistorted: bool = False  # the poses fit without the distortion of the lens
+    worst: tuple[str, ...] = ()  # photographs whose matches are explained least
 
 
 def decide(photographs: Sequence[Photograph], convention: Convention) -> Decision:
-    """Find the reading by which the photographs' poses explain by far most of what pairs of them have in common; as
-    written if there is too little of that, or a camera cannot be used."""
+    """Find the reading by which the poses explain by far most of what pairs of photographs have in common; as written
+    if there is too little of that, or a camera cannot be used."""
     from bitymi_ns.capture import two_views  # slow to import
 
-    named = readings(convention)
-    as_written, cameras = Decision(named[WRITTEN]), [each.camera for each in photographs]
+    named, poses = readings(convention), np.stack([each.pose for each in photographs])
+    written, cameras = named[WRITTEN], [each.camera for each in photographs]
     lenses = [camera.colmap for camera in dict.fromkeys(cameras)]
-    if not all(
-        np.isfinite(lens.params).all() and (lens.params[lens.focal_length_idxs()] > 0.0).all() for lens in lenses
-    ):
-        return as_written
-    pairs = two_views.match_pairs(photographs)
-    own = two_views.explained(pairs, two_views.rays_of(pairs, cameras))
+    focals = [value for lens in lenses for value in lens.params[lens.focal_length_idxs()]]
+    usable = all(np.isfinite(lens.params).all() for lens in lenses) and min(focals, default=1.0) > 0.0
+    pairs = two_views.match_pairs(photographs) if usable else []
+    own, total = two_views.explained(pairs, two_views.rays_of(pairs, cameras)), sum(len(pair.x) for pair in pairs)
     if own.sum() < ENOUGH:
-        return as_written
-    poses, total = np.stack([each.pose for each in photographs]), sum(len(pair.x) for pair in pairs)
-
-    def explained(every: Sequence[Reading], cameras: Sequence[ColmapCamera]) -> dict[Reading, npt.NDArray[np.int64]]:
-        """Count the matches that readings of one kind of intrinsics explain."""
-        seen = two_views.rays_of(pairs, [camera_as(camera, every[0]) for camera in cameras])
-        return {each: two_views.explained(pairs, seen, read_as(poses, convention, each)[0]) for each in every}
-
-    def best(counts: dict[Reading, npt.NDArray[np.int64]]) -> Decision:
-        """Choose the reading that explains most; it is far ahead, or as written."""
-        most = max(counts, key=lambda each: counts[each].sum())
-        share, least = counts[most].sum() / total, FITS * own.sum() / total
-        ahead = share >= max(least, LEAD * written.sum() / total)
-        fits = written.sum() / total >= least
-        reading = most if ahead else named[WRITTEN] if fits else None
-        return Decision(reading, float(share), float(written.sum() / total), float(own.sum() / total))
-
-    kinds = {kind: [each for each in named.values() if each.intrinsics == kind] for kind in ("", *INTRINSICS, SWAPPED)}
-    counts = explained(kinds[""], cameras)
-    written = counts[named[WRITTEN]]
-    decision = best(counts)
-    if decision.reading is not None:
-        return decision
-    for kind, every in kinds.items():
-        counts |= explained(every, cameras) if kind else {}
-    decision = best(counts)
-    if decision.reading is not None:
-        return decision
-    straight = [camera._replace(model="PINHOLE", params=tuple(camera.colmap.calibration_matrix()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()))
-                for camera in cameras if camera.model != SPHERICAL_MODEL]  # fmt: skip
-    fits = len(straight) == len(cameras) and best(explained([named[WRITTEN]], straight)).reading is not None
+        return Decision(written)
+    counts: dict[Reading, npt.NDArray[np.int64]] = {}
+    for kinds in ([""], [*INTRINSICS, NO_DISTORTION]):
+        for kind in kinds:
+            rays = two_views.rays_of(pairs, [camera_as(camera, Reading(intrinsics=kind)) for camera in cameras])
+            some = [each for each in named.values() if each.intrinsics == kind]
+            counts |= {each: two_views.explained(pairs, rays, read_as(poses, convention, each)[0]) for each in some}
+        best = max(counts, key=lambda each: counts[each].sum())
+        share, as_written, most = (float(each.sum() / total) for each in (counts[best], counts[written], own))
+        if share >= max(FITS * most, LEAD * as_written):
+            return Decision(best, share, as_written, most)
+        if as_written >= FITS * most:
+            return Decision(written, share, as_written, most)
     sums = np.zeros((2, len(photographs)))
-    for pair, *both in zip(pairs, written, own, strict=True):
-        for i in (pair.first, pair.second):
-            sums[:, i] += both
+    for pair, *both in zip(pairs, counts[written], own, strict=True):
+        sums[:, [pair.first, pair.second]] += np.array(both)[:, None]
     worst = [photographs[i].file.name for i in np.argsort(sums[0] / np.maximum(sums[1], 1e-9)) if sums[1, i]]
-    return decision._replace(worst=tuple(worst[:3]), undistorted=fits)
+    return Decision(None, share, as_written, most, tuple(worst[:3]))
 
 
 _decided: dict[str, Decision] = {}  # commands read a capture twice: to check it first, and to use it
@@ -212,12 +193,10 @@ def as_meant(
 def _report(decision: Decision, source: str) -> None:
     reading = decision.reading
     if reading is None:
-        remedy = "Poses found from the photographs: `bitymi sfm`."
-        if decision.undistorted:
-            remedy = "They fit without the lens distortion: set its coefficients to 0."
         warn(
             f"{source}: the photographs contradict their poses, which explain {decision.written:.0%} of what pairs of "
-            f"photographs have in common, where {decision.own:.0%} can be; least in {listed(decision.worst)}. {remedy}"
+            f"photographs have in common, where {decision.own:.0%} can be; least in {listed(decision.worst)}. "
+            "`bitymi sfm` finds poses from the photographs."
         )
     elif any(reading):
         words = ", ".join(WORDS[part] for part in reading if part)

@@ -100,40 +100,41 @@ def test_every_misreading_is_found(convention: Convention, photographs: list[Pho
 def test_a_mirrored_camera_leaves_the_world(photographs: list[Photograph]) -> None:
     """Camera axes alone may be left-handed: the determinant is negative."""
     right = poses_of(photographs)
-    meant, mirror = read_as(right @ MIRROR, Convention(), readings.readings(Convention())["left-handed"])
+    meant, mirror = read_as(right @ MIRROR, JSON, readings.readings(JSON)["left-handed"])
     assert mirror is None
     np.testing.assert_allclose(meant, right, atol=1e-12)
 
 
-@pytest.mark.parametrize("reading", [Reading(intrinsics=kind) for kind in (*INTRINSICS, SWAPPED)])
+@pytest.mark.parametrize("reading", [Reading(intrinsics=kind) for kind in INTRINSICS])
 def test_intrinsics_of_other_pictures(reading: Reading, photographs: list[Photograph], reported: list[str]) -> None:
     camera = photographs[0].camera
     undo = SWAPPED if reading.intrinsics == SWAPPED else f"intrinsics{1 / INTRINSICS[reading.intrinsics]:g}"
     given = [replace(each, camera=camera_as(camera, Reading(intrinsics=undo))) for each in photographs]
-    meant, _, name = as_meant(given, Convention(), "transforms.json", "auto", True)
+    meant, _, name = as_meant(given, JSON, "transforms.json", "auto", True)
     assert name == reading.intrinsics and meant[0].camera == camera
     assert f"the poses are read as {readings.WORDS[name]}" in reported[-1]
 
 
 def test_none_fits(photographs: list[Photograph], reported: list[str]) -> None:
-    """Poses of another path are kept, with a warning; a distortion that is wrong is named."""
+    """Poses of another path are kept, with a warning; a distortion that is wrong is left out."""
     given = [replace(each, pose=other.pose) for each, other in zip(photographs, photographs[::-1], strict=True)]
-    meant, mirror, name = as_meant(given, Convention(), "transforms.json", "auto", True)
+    meant, mirror, name = as_meant(given, JSON, "transforms.json", "auto", True)
     assert (name, mirror) == ("written", None) and (poses_of(meant) == poses_of(given)).all()
     assert "transforms.json: the photographs contradict their poses" in reported[-1]
     assert "`bitymi sfm`" in reported[-1]
     lens = ColmapCamera("OPENCV", *SIZE, (*photographs[0].camera.params, 3.0, 9.0, 0.0, 0.0))
-    as_meant([replace(each, camera=lens) for each in photographs], Convention(), "t.json", "auto", True)
-    assert "They fit without the lens distortion" in reported[-1]
+    meant, _, name = as_meant([replace(each, camera=lens) for each in photographs], JSON, "t.json", "auto", True)
+    assert name == "no-distortion" and meant[0].camera == photographs[0].camera
+    assert "read as without lens distortion" in reported[-1]
 
 
 def test_what_is_asked_for(photographs: list[Photograph], reported: list[str]) -> None:
     """A name is taken without looking at photographs; too little to look at leaves poses as they are."""
     given = [replace(each, pose=each.pose @ OPENCV_AXES, file=Path("gone.png")) for each in photographs]
-    meant, _, name = as_meant(given, Convention(), "transforms.json", "opencv", True)
+    meant, _, name = as_meant(given, JSON, "transforms.json", "opencv", True)
     assert name == "opencv" and (poses_of(meant) == poses_of(photographs)).all()
-    assert as_meant(given, Convention(), "transforms.json", "auto", False)[2] == "written"
-    assert decide(given, Convention()) == readings.Decision(Reading())
+    assert as_meant(given, JSON, "transforms.json", "auto", False)[2] == "written"
+    assert decide(given, JSON) == readings.Decision(Reading())
     assert not reported
     with refused("--poses-as is unity, but transforms.json can be read as auto, written, turn90"):
-        as_meant(given, Convention(), "transforms.json", "unity", True)
+        as_meant(given, JSON, "transforms.json", "unity", True)

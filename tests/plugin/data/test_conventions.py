@@ -15,7 +15,7 @@ from bitymi_ns.capture import readings
 from bitymi_ns.capture.points import read_points
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from tests.captures import edit, edit_frames, load_any, printed
-from tests.formats import PHOTOGRAPHS, SCANS, colmap, scannet, stray_scanner
+from tests.formats import JSON, SCANS, colmap, scannet, stray_scanner
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
@@ -50,9 +50,15 @@ def of_json(capture: Path, change: Change) -> Path:
     return capture
 
 
+def model(capture: Path) -> Path:
+    folder = colmap(capture)
+    (folder / "cameras.txt").write_text("1 PINHOLE 320 240 256 256 160 120\n")
+    return folder
+
+
 def of_model(capture: Path, change: Change, order: str = "wxyz") -> Path:
     """Change the poses, world to camera, of the room as a COLMAP model, and write quaternions in an order."""
-    path, lines = colmap(capture) / "images.txt", []
+    path, lines = model(capture) / "images.txt", []
     for line in filter(None, path.read_text().splitlines()):
         number, *pose, camera, name = line.split()
         w2c = np.eye(4)
@@ -72,7 +78,7 @@ def of_scan(capture: Path, change: Change) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("form", [*PHOTOGRAPHS, *SCANS, stray_scanner])
+@pytest.mark.parametrize("form", [*JSON, model, *SCANS, stray_scanner])
 def test_right_ones_are_nothing_to_speak_of(
     capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:

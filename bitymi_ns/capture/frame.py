@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from bitymi_ns.capture.types import say, warn
 from bitymi_ns.files import write_file
 from bitymi_ns.safe_reading import read_json
 
@@ -16,6 +17,7 @@ EARTH = 6378137.0  # equatorial radius in metres, WGS 84
 FLATTENING = 1 / 298.257223563
 GPS_ERROR = 5.0  # of phones, metres
 LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions that determines the scale, metres
+MINIMAL, SAMPLES, STEPS = 3, 300, 3  # positions that determine a similarity, random choices of them, steps from each
 SAME_SHAPE = 0.5  # largest error of an alignment, relative to the spread
 FILE = "frame.json"  # beside the report
 UP = (0.0, 0.0, 1.0)  # up in the world frame
@@ -32,7 +34,7 @@ class WorldFrame:
     metres_per_unit: float | None  # 1 with scale by GPS; None = unknown
     gps_origin: tuple[float, float, float] | None
     """Latitude, longitude (degrees) and altitude (metres) of the origin, x east and y north there."""
-    gps_error: float | None  # median distance between cameras and their GPS positions, metres
+    gps_error: float | None  # median distance of cameras from GPS positions that agree, metres
     gps_positions: int  # photographs with a position
     transform: list[list[float]]  # [3, 4] from COLMAP's world, with scale
 
@@ -93,14 +95,16 @@ def move_to_world(
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
     names = [name for name in centers if name in local]
     placed, positions = np.array([centers[n] for n in names]), np.array([local[n] for n in names])
-    similarity = _by_gps(placed, positions)
-    if similarity is not None:
+    found = _by_gps(placed, positions)
+    if found is not None:
+        similarity, agree = found
         source, by_phones = "gps", None if up is None else similarity.rotation.matrix() @ up
         if by_phones is not None and by_phones @ UP > STEEPEST:
             turn = pycolmap.Rotation3d(_smallest_turn(by_phones, np.array(UP)))
             source, similarity = "gravity", pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
         model.transform(similarity)
-        error = _gps_error(similarity, placed, positions)
+        error = float(np.median(_gps_errors(similarity, placed, positions)[agree]))
+        say(f"GPS makes the world: {agree.sum()} of {len(agree)} photographs with a position agree to {error:.1f} m.")
         return WorldFrame(source, 1.0, origin, error, len(local), similarity.matrix().tolist())
     similarity = _by_up(model, np.array(list(centers.values())), up)
     model.transform(similarity)
@@ -108,10 +112,9 @@ def move_to_world(
     return WorldFrame(source, None, None, None, len(local), similarity.matrix().tolist())
 
 
-def _gps_error(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.ndarray) -> float:
-    """Measure the median distance in metres between cameras [n, 3] after a similarity and their GPS positions [n,
-    3]."""
-    return float(np.median(np.linalg.norm((similarity * centers) - positions, axis=1)))
+def _gps_errors(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Measure the distances [n] in metres between cameras [n, 3] after a similarity and their GPS positions [n, 3]."""
+    return np.linalg.norm((similarity * centers) - positions, axis=1)
 
 
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
@@ -136,23 +139,36 @@ def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
     return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
-def _by_gps(centers: np.ndarray, positions: np.ndarray) -> pycolmap.Sim3d | None:
-    """Align centers [n, 3] with positions [n, 3] in metres; None if these are too few, too close together, on one line,
-    or of another shape."""
+def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d, np.ndarray] | None:
+    """Align centers [n, 3] with the largest group [n] of positions [n, 3] in metres that agree; None if these are too
+    few, too close together, on one line, or of another shape."""
     if len(positions) < 3:
         return None
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
     shape = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
     if spread[0] < LEAST_SPREAD or spread[1] < LEAST_SPREAD / 2 or shape[1] < 0.05 * shape[0]:
         return None
-    options = pycolmap.RANSACOptions()
-    options.max_error = 2 * GPS_ERROR
-    options.random_seed = 0
-    found = pycolmap.estimate_sim3d_robust(centers, positions, options)
-    if found is None:
+    rng, best, least = np.random.default_rng(0), None, np.inf
+    half = min(len(positions), max(len(positions) // 2, MINIMAL + 2))  # the others may be of another flight
+    for _ in range(SAMPLES):  # least trimmed squares
+        closest = rng.choice(len(positions), MINIMAL, replace=False)
+        for _ in range(STEPS):
+            found = pycolmap.estimate_sim3d(centers[closest], positions[closest])
+            if found is None:
+                break
+            errors = _gps_errors(found, centers, positions)
+            closest = np.argsort(errors)[:half]
+            if (total := np.square(errors[closest]).sum()) < least:
+                best, least = errors, total
+    if best is None:
         return None
-    similarity = found["tgt_from_src"] if isinstance(found, dict) else found  # as pycolmap 4.1 and 4.2 have it
-    return similarity if _gps_error(similarity, centers, positions) < SAME_SHAPE * spread[0] else None
+    agree = best <= np.clip(3 * np.sort(best)[half - 1], GPS_ERROR, 2 * GPS_ERROR)
+    if 2 * agree.sum() < len(agree):
+        warn(f"GPS is not used: at most {agree.sum()} of {len(agree)} photographs agree on it to {2 * GPS_ERROR:g} m.")
+        return None
+    similarity = pycolmap.estimate_sim3d(centers[agree], positions[agree])
+    fits = np.median(_gps_errors(similarity, centers, positions)[agree]) < SAME_SHAPE * spread[0]
+    return (similarity, agree) if fits else None
 
 
 def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray | None) -> pycolmap.Sim3d:

@@ -185,7 +185,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         fail(
             f"{label} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used: its size and focal "
-            "lengths have to be positive and all parameters finite. Correct it, or export the model from COLMAP again."
+            "lengths have to be positive and all parameters finite. Correct it: write a focal length without its sign."
         )
     center = (camera.principal_point_x, camera.principal_point_y)
     lens = Lens(colmap, stored, Pinhole(*focal, *center, width, height))

@@ -72,17 +72,22 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
 def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
     """Check the poses of a transforms.json's frames, and replace them by rotations, see `rotations`."""
     names = [frame["file_path"] for frame in frames]
-    poses = []
+    poses, scaled = [], []
     for frame, name in zip(frames, names, strict=True):
         pose = as_matrix(frame["transform_matrix"])
         if pose is None:
             what = f"the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers"
             fail(f"{path}: {what}. Correct it or remove the frame.")
+        if pose[3, 3] and not pose[3, :3].any():
+            scaled += [name] * (abs(pose[3, 3] - 1.0) > 1e-6)
+            pose = pose / pose[3, 3]  # homogeneous: a factor on all 16 numbers says nothing
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             row = " ".join(f"{x:g}" for x in pose[3])
             why = "A matrix whose position stands in its last row has to be transposed."
             fail(f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. {why}")
         poses.append(pose)
+    if scaled:
+        say(f"{path}: the transform_matrix of {listed(scaled)} is divided by its last number, which is not 1.")
     matrices = np.stack(poses)
     matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
     for frame, pose in zip(frames, matrices, strict=True):

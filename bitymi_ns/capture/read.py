@@ -16,7 +16,7 @@ from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.masks import check_masks, with_masks
 from bitymi_ns.capture.points import Points, read_cloud, with_colors
 from bitymi_ns.capture.pose_checks import fit_scale
-from bitymi_ns.capture.readings import AUTO, Convention, as_meant
+from bitymi_ns.capture.readings import AUTO, WRITTEN, Reading, as_meant
 from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
 from bitymi_ns.capture.scanner_views import Y_UP, scanner_photographs
 from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
@@ -43,12 +43,12 @@ OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "poses_as": ("nerfstudio", "instant-ngp", "blender", "colmap", *SCANNED),
 }
 """Formats of options that are not for all formats."""
-CONVENTIONS: dict[str, Convention] = {
-    "colmap": Convention("opencv", "w2c", "wxyz", TO_Z_UP), "polycam": Convention(frame=Y_UP),
-    "record3d": Convention(order="xyzw", frame=Y_UP), "3d-scanner": Convention(frame=Y_UP),
-    "stray-scanner": Convention("opencv", "c2w", "xyzw", Y_UP), "pose-files": Convention("opencv"),
+CONVENTIONS: dict[str, tuple[Reading, Pose]] = {
+    "colmap": (Reading("opencv", "w2c", "wxyz"), TO_Z_UP), "pose-files": (Reading("opencv"), np.eye(4)),
+    "polycam": (Reading(), Y_UP), "record3d": (Reading(order="xyzw"), Y_UP), "3d-scanner": (Reading(), Y_UP),
+    "stray-scanner": (Reading("opencv", "c2w", "xyzw"), Y_UP),
 }  # fmt: skip
-"""Conventions of formats; of others camera to world with OpenGL axes."""
+"""Conventions of formats, with the transform of their world; of others camera to world with OpenGL axes."""
 NGP_SCALE = 0.3333  # factor on positions of instant-ngp's captures, as in nerfstudio's reader
 BLENDER_SIDE = 1.5  # half the side of a Blender data set's box, as in nerfstudio's reader
 
@@ -150,7 +150,7 @@ class _Reader:
     need_photos: bool
     want_points: bool
     poses_as: str = AUTO
-    mirror: Pose | None = None  # reflection [4, 4] of the world if that is left-handed
+    mirror: Pose = field(default_factory=lambda: np.eye(4))  # reflection of the world if that is left-handed
 
     def read(self) -> Capture:
         found = self.found
@@ -306,10 +306,9 @@ class _Reader:
 
     def _as_meant(self, photographs: Sequence[Photograph], source: str) -> list[Photograph]:
         """Give photographs the poses that they are meant to have; see `as_meant`."""
-        convention = CONVENTIONS.get(self.found.format, Convention())
-        meant, self.mirror, self.poses_as = as_meant(
-            photographs, convention, source, self.options.poses_as, self.need_photos
-        )
+        convention, asked = CONVENTIONS.get(self.found.format, (Reading(), np.eye(4))), self.options.poses_as
+        asked = asked if asked != AUTO or self.need_photos else WRITTEN
+        meant, self.mirror, self.poses_as = as_meant(photographs, *convention, source, asked)
         return meant
 
     def _cloud(self, path: Path, remedy: str, photographs: Sequence[Photograph]) -> Points:
@@ -317,7 +316,7 @@ class _Reader:
         return self._colored(points, reason, photographs, path)
 
     def _colored(self, points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
-        if self.mirror is not None:
+        if (self.mirror != np.eye(4)).any():
             points = points._replace(xyz=points.xyz @ self.mirror[:3, :3].T + self.mirror[:3, 3])
         return with_colors(points, without, photographs, source) if self.want_points else points
 

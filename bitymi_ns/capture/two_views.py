@@ -11,6 +11,7 @@ import pycolmap
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, read_image
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.order import natural
+from bitymi_ns.capture.sfm.consistency import rays_meet
 from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, Pose
 from bitymi_ns.ranges import spread
 
@@ -23,7 +24,8 @@ FEATURES, COARSE = 1500, 128  # features of a photograph; largest ones that deci
 RATIO = 0.8  # most ratio of the distances of a feature's nearest and second nearest
 PAIRS, TRIALS = 20, 80  # pairs wanted, and pairs matched at most
 ALIKE = 8  # least matches of coarse features of a pair that is not near by name
-LEAST = 15  # least matches of a pair that its own essential matrix explains
+LEAST, OWN = 15, 0.4  # least matches of a pair, and share of them, that its own essential matrix explains
+SAMPLES = 1000  # random samples in the search for that matrix, at most
 MOTION = 0.05  # least median motion between the photographs of a pair, in longer sides
 TOLERANCE = 0.004  # largest distance to the epipolar plane, in longer sides; matches that move less tell nothing
 STILL = 1e-4  # baseline, relative to the largest coordinate of a camera, below which cameras are at one place
@@ -110,53 +112,43 @@ def _match(cameras: Sequence[ColmapCamera], i: int, j: int, a: Features, b: Feat
     matched = _mutual(a[1], b[1])
     x, y = a[0][matched[:, 0]], b[0][matched[:, 1]]
     motion = np.linalg.norm(x / max(cameras[i].size) - y / max(cameras[j].size), axis=1)
-    x, y = x[motion > TOLERANCE], y[motion > TOLERANCE]
-    if len(x) < LEAST or np.median(motion) < MOTION:
+    moves = motion > TOLERANCE
+    x, y = x[moves], y[moves]
+    if len(x) < LEAST or np.median(motion[moves]) < MOTION:
         return None
-    options = pycolmap.RANSACOptions()
-    options.max_error, options.random_seed = TOLERANCE * max(cameras[i].size), 0
+    options = pycolmap.RANSACOptions(max_num_trials=SAMPLES, random_seed=0)
+    options.max_error = TOLERANCE * max(cameras[i].size)
     found = pycolmap.estimate_essential_matrix(x, y, cameras[i].colmap, cameras[j].colmap, options)
     if found is None:
         return None
     pair = Pair(i, j, x, y, found["cam2_from_cam1"].matrix())
-    return pair if explained([pair], rays_of([pair], cameras))[0] >= LEAST else None
+    return pair if explained([pair], rays_of([pair], cameras))[0] >= max(LEAST, OWN * len(x)) else None
 
 
-def rays_of(pairs: Sequence[Pair], cameras: Sequence[ColmapCamera]) -> list[tuple[Array, Array, float, float]]:
-    """Compute the unit rays [n, 3] of each pair's matches in both cameras' axes (OpenCV), and the tolerances, radians;
+def rays_of(pairs: Sequence[Pair], cameras: Sequence[ColmapCamera]) -> list[tuple[Array, Array, float]]:
+    """Compute the unit rays [n, 3] of each pair's matches in both cameras' axes (OpenCV), and the tolerance in radians;
     `cameras` of all photographs."""
     lenses = {camera: camera.colmap for camera in dict.fromkeys(cameras)}
-    angles = {}
-    for camera, lens in lenses.items():
-        focal = camera.width / (2.0 * np.pi) if lens.is_spherical() else lens.focal_length_x
-        angles[camera] = TOLERANCE * max(camera.size) / focal
-    sides = [[(cameras[i], points) for i, points in ((pair.first, pair.x), (pair.second, pair.y))] for pair in pairs]
-    return [
-        (*(lenses[camera].cam_ray_from_img(points) for camera, points in each), *(angles[camera] for camera, _ in each))
-        for each in sides
-    ]
+    rays = []
+    for pair in pairs:
+        first, second = lenses[cameras[pair.first]], lenses[cameras[pair.second]]
+        focal = second.width / (2.0 * np.pi) if second.is_spherical() else second.mean_focal_length()
+        limit = TOLERANCE * max(second.width, second.height) / focal
+        rays.append((first.cam_ray_from_img(pair.x), second.cam_ray_from_img(pair.y), limit))
+    return rays
 
 
 def explained(
-    pairs: Sequence[Pair], rays: Sequence[tuple[Array, Array, float, float]], poses: Pose | None = None
+    pairs: Sequence[Pair], rays: Sequence[tuple[Array, Array, float]], poses: Pose | None = None
 ) -> npt.NDArray[np.int64]:
-    """Count the matches of each pair [P] that lie within the tolerance of the epipolar plane, seen from both cameras,
-    and whose rays, see `rays_of`, meet in front of both. `poses`: [N, 4, 4] camera to world with OpenGL axes, of all
-    photographs; None = the pairs' own."""
+    """Count the matches of each pair [P] whose rays, see `rays_of`, meet in front of both cameras. `poses`: [N, 4, 4]
+    camera to world with OpenGL axes, of all photographs; None = the pairs' own."""
     counts = np.zeros(len(pairs), np.int64)
     to_world = None if poses is None else poses @ OPENCV_AXES
+    to_camera = None if to_world is None else np.linalg.inv(to_world)
     least = 0.0 if poses is None else STILL * np.abs(poses[:, :3, 3]).max()
-    for k, (pair, (first, b, *angles)) in enumerate(zip(pairs, rays, strict=True)):
-        move = pair.own if to_world is None else np.linalg.inv(to_world[pair.second]) @ to_world[pair.first]
-        t = move[:3, 3]
-        if np.linalg.norm(t) <= least:  # without a baseline every match would lie in the plane
-            continue
-        with np.errstate(invalid="ignore"):
-            a = first @ move[:3, :3].T
-            off = np.abs(np.cross(a, b) @ t)  # volume that the rays span with the baseline
-            near = (off <= angles[1] * np.linalg.norm(np.cross(a, t), axis=1)) & (
-                off <= angles[0] * np.linalg.norm(np.cross(b, t), axis=1)
-            )
-            ab, at, bt = (a * b).sum(1), a @ t, b @ t
-            counts[k] = (near & (ab * bt > at) & (bt > ab * at)).sum()  # depths along the rays, times 1 - ab ** 2
+    for k, (pair, (a, b, limit)) in enumerate(zip(pairs, rays, strict=True)):
+        move = pair.own if to_world is None else (to_camera[pair.second] @ to_world[pair.first])[:3]
+        if np.linalg.norm(move[:, 3]) > least:  # without a baseline every match would lie in the plane
+            counts[k] = rays_meet(a, b, move, limit).sum()
     return counts

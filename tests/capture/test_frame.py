@@ -53,6 +53,25 @@ def test_gps_gives_metres_and_up() -> None:
     assert np.median([np.linalg.norm(a) / np.linalg.norm(b) for a, b in spans]) == pytest.approx(1, abs=0.05)
 
 
+def test_the_larger_group_of_positions_counts(reported: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second half of the photographs is of another flight, 15 m higher."""
+    monkeypatch.setattr("bitymi_ns.capture.frame.say", reported.append)
+    model = synthetic()
+    scale = 40 / np.std(list(centers(model).values()))
+    true = {name: scale * place for name, place in centers(model).items()}
+    places = {name: to_degrees(place + (0, 0, 15 * (i >= 6))) for i, (name, place) in enumerate(true.items())}
+    frame = move_to_world(model, places)
+    assert frame.up == "gps" and frame.gps_error < 0.1
+    turn = np.array(frame.transform)[:, :3]
+    assert np.cbrt(np.linalg.det(turn)) == pytest.approx(scale, rel=0.002)
+    assert turn[2] @ UP / np.linalg.norm(turn[2]) > 0.99999
+    assert reported == ["GPS makes the world: 6 of 12 photographs with a position agree to 0.0 m."]
+    rng = np.random.default_rng(0)
+    places = {name: to_degrees(place + rng.normal(0, 60, 3) * (i >= 5)) for i, (name, place) in enumerate(true.items())}
+    assert move_to_world(synthetic(), places).up == "cameras"
+    assert "GPS is not used" in reported[-1]
+
+
 @pytest.mark.parametrize("size", [0.0, 3.0])
 def test_positions_too_close_together_or_of_another_shape_say_nothing(size: float) -> None:
     model = synthetic()

@@ -15,7 +15,6 @@ from bitymi_ns.capture.readings import (
     MIRROR,
     SWAPPED,
     TURNS,
-    Convention,
     Reading,
     as_meant,
     camera_as,
@@ -28,9 +27,9 @@ from tests.capture.conftest import SIZE
 from tests.captures import refused
 
 QUARTER = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-COLMAP = Convention("opencv", "w2c", "wxyz", np.diag([1.0, -1.0, -1.0, 1.0]))
-JSON = Convention()
-SCANNER = Convention(order="xyzw")
+COLMAP = Reading("opencv", "w2c", "wxyz")
+JSON = Reading()
+SCANNER = Reading(order="xyzw")
 
 
 @pytest.fixture(scope="session")
@@ -69,72 +68,69 @@ def test_matches_need_no_poses(photographs: list[Photograph], pairs: list[two_vi
     assert explained(pairs, photographs, still) == 0, "cameras at one place explain nothing"
 
 
-def misread(right: np.ndarray, own: Convention, meant: Reading) -> np.ndarray:
+def misread(right: np.ndarray, own: Reading, meant: Reading) -> np.ndarray:
     """Write poses in the convention of a reading, and read the file in the format's own."""
-    poses = np.linalg.inv(own.frame) @ right @ np.linalg.matrix_power(QUARTER, -TURNS.get(meant.turn, 0) // 90)
-    axes = meant.axes or own.axes
-    poses = MIRROR @ poses @ MIRROR if axes == "left-handed" else poses @ CAMERA_AXES[axes]
-    poses = np.linalg.inv(poses) if (meant.direction or own.direction) == "w2c" else poses
+    poses = right @ np.linalg.matrix_power(QUARTER, -TURNS[meant.turn] // 90)
+    poses = MIRROR @ poses @ MIRROR if meant.axes == "lefthanded" else poses @ CAMERA_AXES[meant.axes]
+    poses = np.linalg.inv(poses) if meant.direction == "w2c" else poses
     if own.order:
         columns = {"xyzw": [0, 1, 2, 3], "wxyz": [3, 0, 1, 2]}
-        numbers = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, columns[meant.order or own.order]]
+        numbers = Rotation.from_matrix(poses[:, :3, :3]).as_quat()[:, columns[meant.order]]
         poses[:, :3, :3] = Rotation.from_quat(numbers[:, np.argsort(columns[own.order])]).as_matrix()
     poses = np.linalg.inv(poses) if own.direction == "w2c" else poses
-    return own.frame @ poses @ CAMERA_AXES[own.axes]
+    return poses @ CAMERA_AXES[own.axes]
 
 
 @pytest.mark.usefixtures("matched")
 @pytest.mark.parametrize("convention", [JSON, COLMAP, SCANNER])
-def test_every_misreading_is_found(convention: Convention, photographs: list[Photograph]) -> None:
+def test_every_misreading_is_found(convention: Reading, photographs: list[Photograph]) -> None:
     right = poses_of(photographs)
-    for reading in readings.readings(convention).values():
+    for reading in readings.readings(convention):
         if not reading.intrinsics and (convention is JSON or not reading.turn):
             wrong = misread(right, convention, reading)
-            given = [replace(each, pose=pose) for each, pose in zip(photographs, wrong, strict=True)]
-            assert decide(given, convention).reading == reading
+            assert decide(photographs, wrong, convention).reading == reading
             meant, mirror = read_as(wrong, convention, reading)
-            assert (mirror is not None) == (reading.axes == "left-handed")
+            assert (np.linalg.det(mirror) < 0.0) == (reading.axes == "lefthanded")
             np.testing.assert_allclose(meant, right, atol=1e-9)
 
 
 def test_a_mirrored_camera_leaves_the_world(photographs: list[Photograph]) -> None:
     """Camera axes alone may be left-handed: the determinant is negative."""
     right = poses_of(photographs)
-    meant, mirror = read_as(right @ MIRROR, JSON, readings.readings(JSON)["left-handed"])
-    assert mirror is None
+    meant, mirror = read_as(right @ MIRROR, JSON, Reading("lefthanded"))
+    assert (mirror == np.eye(4)).all()
     np.testing.assert_allclose(meant, right, atol=1e-12)
 
 
-@pytest.mark.parametrize("reading", [Reading(intrinsics=kind) for kind in INTRINSICS])
-def test_intrinsics_of_other_pictures(reading: Reading, photographs: list[Photograph], reported: list[str]) -> None:
+@pytest.mark.parametrize("kind", [*INTRINSICS, SWAPPED])
+def test_intrinsics_of_other_pictures(kind: str, photographs: list[Photograph], reported: list[str]) -> None:
     camera = photographs[0].camera
-    undo = SWAPPED if reading.intrinsics == SWAPPED else f"intrinsics{1 / INTRINSICS[reading.intrinsics]:g}"
-    given = [replace(each, camera=camera_as(camera, Reading(intrinsics=undo))) for each in photographs]
-    meant, _, name = as_meant(given, JSON, "transforms.json", "auto", True)
-    assert name == reading.intrinsics and meant[0].camera == camera
-    assert f"the poses are read as {readings.WORDS[name]}" in reported[-1]
+    undo = SWAPPED if kind == SWAPPED else f"intrinsics{1 / INTRINSICS[kind]:g}"
+    given = [replace(each, camera=camera_as(camera, undo)) for each in photographs]
+    meant, _, name = as_meant(given, JSON, np.eye(4), "transforms.json", "auto")
+    assert name == f"opengl-c2w-{kind}" and meant[0].camera == camera
+    assert f"the poses are read as {name}, which explains" in reported[-1]
 
 
 def test_none_fits(photographs: list[Photograph], reported: list[str]) -> None:
     """Poses of another path are kept, with a warning; a distortion that is wrong is left out."""
     given = [replace(each, pose=other.pose) for each, other in zip(photographs, photographs[::-1], strict=True)]
-    meant, mirror, name = as_meant(given, JSON, "transforms.json", "auto", True)
-    assert (name, mirror) == ("written", None) and (poses_of(meant) == poses_of(given)).all()
-    assert "transforms.json: the photographs contradict their poses" in reported[-1]
+    meant, mirror, name = as_meant(given, JSON, np.eye(4), "transforms.json", "auto")
+    assert name == "written" and (mirror == np.eye(4)).all() and (poses_of(meant) == poses_of(given)).all()
+    assert "transforms.json: the poses contradict the photographs" in reported[-1]
     assert "`bitymi sfm`" in reported[-1]
     lens = ColmapCamera("OPENCV", *SIZE, (*photographs[0].camera.params, 3.0, 9.0, 0.0, 0.0))
-    meant, _, name = as_meant([replace(each, camera=lens) for each in photographs], JSON, "t.json", "auto", True)
-    assert name == "no-distortion" and meant[0].camera == photographs[0].camera
-    assert "read as without lens distortion" in reported[-1]
+    given = [replace(each, camera=lens) for each in photographs]
+    meant, _, name = as_meant(given, JSON, np.eye(4), "transforms.json", "auto")
+    assert name == "opengl-c2w-undistorted" and meant[0].camera == photographs[0].camera
 
 
 def test_what_is_asked_for(photographs: list[Photograph], reported: list[str]) -> None:
     """A name is taken without looking at photographs; too little to look at leaves poses as they are."""
     given = [replace(each, pose=each.pose @ OPENCV_AXES, file=Path("gone.png")) for each in photographs]
-    meant, _, name = as_meant(given, JSON, "transforms.json", "opencv", True)
-    assert name == "opencv" and (poses_of(meant) == poses_of(photographs)).all()
-    assert as_meant(given, JSON, "transforms.json", "auto", False)[2] == "written"
-    assert decide(given, JSON) == readings.Decision(Reading())
+    meant, _, name = as_meant(given, JSON, np.eye(4), "transforms.json", "opencv-c2w")
+    assert name == "opencv-c2w" and (poses_of(meant) == poses_of(photographs)).all()
+    assert decide(given, poses_of(given), JSON) == readings.Decision(JSON)
     assert not reported
-    with refused("--poses-as is unity, but transforms.json can be read as auto, written, turn90"):
-        as_meant(given, JSON, "transforms.json", "unity", True)
+    with refused("--poses-as is unity, but transforms.json can be read as auto, written, or as opengl-c2w, "):
+        as_meant(given, JSON, np.eye(4), "transforms.json", "unity")

@@ -51,14 +51,14 @@ def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -
             a, b = (rays[i][column] for i, column in zip((first, second), matches.T, strict=True))
             move = placed[second].cam_from_world() * placed[first].cam_from_world().inverse()
             total += len(matches)
-            against += int((~_rays_meet(a, b, move, limit)).sum())
+            against += int((~rays_meet(a, b, move.matrix(), limit)).sum())
     return against / max(total, 1)
 
 
-def _rays_meet(a: np.ndarray, b: np.ndarray, move: pycolmap.Rigid3d, limit: float) -> np.ndarray:
-    """Test [n] which pairs of unit rays [n,3], in the axes of their cameras, meet in front of both. `move`: first
+def rays_meet(a: np.ndarray, b: np.ndarray, move: np.ndarray, limit: float) -> np.ndarray:
+    """Test [n] which pairs of unit rays [n,3], in their cameras' axes, meet in front of both. `move`: [3,4], first
     camera to second; `limit`: largest angle in radians between a ray and the plane of the other and both centres."""
-    a, step = a @ move.rotation.matrix().T, move.translation
+    a, step = a @ move[:, :3].T, move[:, 3]
     normal = np.cross(np.broadcast_to(step, a.shape), a)
     off = np.abs((normal * b).sum(1)) / np.maximum(np.linalg.norm(normal, axis=1), 1e-12)
     cosine = (a * b).sum(1)

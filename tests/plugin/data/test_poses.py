@@ -74,13 +74,16 @@ def test_a_mirrored_capture_is_taken_and_a_mirrored_frame_is_named(
     assert message.count("mirrored against") == 1
 
 
-def test_three_rows_are_enough(capture: Path) -> None:
+def test_three_rows_are_enough(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     clean = load(capture).train_dataset.cameras.camera_to_worlds
     edit_frames(capture, lambda frame: frame.update(transform_matrix=frame["transform_matrix"][:3]))
     assert torch.equal(load(capture).train_dataset.cameras.camera_to_worlds, clean)
     edit_frames(
-        capture, lambda f: f.update(transform_matrix=np.array([*f["transform_matrix"], [0, 0, 0, 1]]).T.tolist())
+        capture, lambda f: f.update(transform_matrix=(np.array([*f["transform_matrix"], [0, 0, 0, 1]]) / 8).tolist())
     )
+    assert torch.equal(load(capture).train_dataset.cameras.camera_to_worlds, clean)
+    assert "is divided by its last number, which is not 1" in printed(capsys)
+    edit_frames(capture, lambda frame: frame.update(transform_matrix=np.array(frame["transform_matrix"]).T.tolist()))
     with expect("last row of the transform_matrix of images/frame_00001.png is .* not 0 0 0 1.*has to be transposed"):
         load(capture)
 

@@ -140,6 +140,7 @@ def stray_scanner(capture: Path, rows: int = 12) -> Path:
     with av.open(str(folder / "rgb.mp4"), "w") as container:
         stream = container.add_stream("mpeg4", rate=10)
         stream.width, stream.height, stream.pix_fmt, stream.bit_rate = meta["w"], meta["h"], "yuv420p", 8_000_000
+        stream.gop_size = 3
         for file, _ in frames:
             container.mux(stream.encode(av.VideoFrame.from_image(Image.open(file).convert("RGB"))))
         container.mux(stream.encode())

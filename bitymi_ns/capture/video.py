@@ -2,6 +2,7 @@
 
 import math
 import os
+from bisect import bisect_left, insort
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -14,7 +15,7 @@ from PIL import Image
 from bitymi_ns.capture.cache import content_key, made_once
 from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
 from bitymi_ns.capture.sfm_photos import sharpness
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, warn
 from bitymi_ns.files import Tell, complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.safe_reading import open_regular
@@ -30,6 +31,14 @@ TRUSTED = {
     "protocol_whitelist": "file",
 }
 """FFmpeg options: a file of any name may be a list of files and URLs to read."""
+AS_STORED = (1, 0, 0, 1)
+TURNS = {
+    AS_STORED: None, (0, 1, -1, 0): Image.Transpose.ROTATE_270, (-1, 0, 0, -1): Image.Transpose.ROTATE_180,
+    (0, -1, 1, 0): Image.Transpose.ROTATE_90, (-1, 0, 0, 1): Image.Transpose.FLIP_LEFT_RIGHT,
+    (1, 0, 0, -1): Image.Transpose.FLIP_TOP_BOTTOM, (0, 1, 1, 0): Image.Transpose.TRANSPOSE,
+    (0, -1, -1, 0): Image.Transpose.TRANSVERSE,
+}  # fmt: skip
+"""Quarter turns and mirrors by a, b, c, d of a display matrix, which moves a pixel to (a x + c y, b x + d y)."""
 LEAST_SURVEYED = 60  # least number of surveyed frames: all of a clip of a second or two
 NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene, with it in view"
 PQ, HLG = 16, 18  # transfer functions of high dynamic range, as ITU-T H.273 numbers them
@@ -67,7 +76,7 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
         return target
     seen, motion, sharp = _survey(video, progress)
     if len(seen) < 3:
-        raise CaptureError(f"{video} holds {len(seen)} frames: film for at least ten seconds, walking round the scene")
+        raise CaptureError(f"{video} has too few frames ({len(seen)}): film for ten seconds, walking round the scene")
     if motion[-1] < STILL:
         raise CaptureError(f"{video} {NO_MOTION}")
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
@@ -78,8 +87,11 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
             shape = float(_pictures(container).sample_aspect_ratio or 1.0)
             shape = shape if 0.25 < shape < 4.0 else 1.0
         wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
-        for written, (number, frame, turn) in enumerate(wanted_frames, 1):
-            image = _upright(frame, turn if upright else 0, shape)
+        for written, (number, frame) in enumerate(wanted_frames, 1):
+            matrix = _display_matrix(frame) if upright else AS_STORED
+            if written == 1 and matrix not in TURNS:
+                warn(f"{video} is taken as stored: its display matrix {matrix} is no quarter turn or mirror.")
+            image = _picture(frame, TURNS.get(matrix), shape)
             image.save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
             progress("writing frames", written, len(numbers))
     return target
@@ -100,7 +112,7 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
     before: np.ndarray | None = None
     last = -math.inf
     gap, rate, total = _pace(video)
-    for number, frame, _ in _frames(video):
+    for number, frame in _frames(video):
         time = number / rate if frame.time is None else frame.time
         if 0.0 <= time - last < gap:  # times may run backwards
             continue
@@ -122,22 +134,24 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
 
 def displacement(first: np.ndarray, second: np.ndarray) -> float:
     """Measure the mean displacement of image blocks by phase correlation, in longer sides; blocks without texture count
-    as still."""
-    size = max(16, min(first.shape) // 3)
-    window = np.outer(np.hanning(size), np.hanning(size))
+    as still, as do images of different sizes."""
+    if first.shape != second.shape:
+        return 0.0
+    height, width = np.minimum(max(16, min(first.shape) // 3), first.shape)
+    window = np.outer(np.hanning(height), np.hanning(width))
     lengths = []
-    for top in np.linspace(0, first.shape[0] - size, 3).astype(int):
-        for left in np.linspace(0, first.shape[1] - size, 3).astype(int):
-            a, b = (image[top : top + size, left : left + size] for image in (first, second))
+    for top in np.linspace(0, first.shape[0] - height, 3).astype(int):
+        for left in np.linspace(0, first.shape[1] - width, 3).astype(int):
+            a, b = (image[top : top + height, left : left + width] for image in (first, second))
             if a.std() < 2.0 or np.abs(a - b).mean() < 0.02 * a.std():  # bare, or without motion beyond noise
                 lengths.append(0.0)
                 continue
             product = np.fft.rfft2((a - a.mean()) * window) * np.conj(np.fft.rfft2((b - b.mean()) * window))
-            peak = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), s=(size, size))
+            peak = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), s=window.shape)
             # a parabola through the peak and its neighbours finds parts of a pixel
             at = np.array(np.unravel_index(peak.argmax(), peak.shape))
             shift = [_between(peak[:, at[1]], at[0]), _between(peak[at[0]], at[1])]
-            shift = [s - size if s > size / 2 else s for s in shift]
+            shift = [s - side if s > side / 2 else s for s, side in zip(shift, window.shape, strict=True)]
             lengths.append(float(np.hypot(*shift)))
     return float(np.mean(lengths)) / max(first.shape)
 
@@ -179,30 +193,58 @@ def _pictures(container: av.container.InputContainer) -> av.VideoStream:
     return container.streams.best("video") or container.streams.video[0]
 
 
-def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame, int]]:
-    """Yield number, frame and display rotation in degrees; skip a broken end."""
+def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame]]:
+    """Yield number, by the timestamps of all, and frame. Damaged frames and those drawn from them, up to the next key
+    frame, are left out; at the end, a line says how many. Raises CaptureError: there are no others."""
     with _opened(video) as container:
         stream = _pictures(container)
         stream.thread_type = "AUTO"
-        number = 0
+        stamps: list[int] = []  # of the packets
+        number, whole, damage, good, packets, hidden, end = -1, True, "", 0, -1, 0, 0.0  # the last packet is empty
         try:
-            for frame in container.decode(stream):
-                yield number, frame, int(frame.rotation)
-                number += 1
+            for packet in container.demux(stream):
+                packets, hidden = packets + 1, hidden + packet.is_discard
+                if packet.pts is not None and not packet.is_discard:
+                    insort(stamps, packet.pts)
+                damage = damage or "it is cut off" * packet.is_corrupt
+                try:
+                    frames = packet.decode()
+                except av.FFmpegError as error:
+                    whole, damage = False, error.strerror
+                    continue
+                for frame in frames:
+                    damage = damage or "its frames are damaged" * frame.is_corrupt
+                    whole = not frame.is_corrupt and (whole or frame.key_frame)
+                    if whole:
+                        number = max(number + 1, 0 if frame.pts is None else bisect_left(stamps, frame.pts))
+                        good, end = good + 1, frame.time or 0.0
+                        yield number, frame
         except av.FFmpegError as error:
-            if number == 0:
-                raise CaptureError(
-                    f"{video} cannot be decoded ({error.strerror}): record or export it again"
-                ) from error
+            damage = error.strerror
+        if damage and not good:
+            raise CaptureError(f"{video} cannot be decoded ({damage}): record or export it again")
+        stated = stream.frames if container.format.name == "avi" else len(stream.index_entries)
+        count = max(stated, packets) - hidden
+        if count > good and (damage or stated > packets):
+            warn(f"{video} is damaged: {count - good} of its {count} frames are left out. Copy it again if you can.")
+        elif "matroska" in container.format.name and end < (length := (container.duration or 0) / 1e6) - 1.0:
+            warn(f"{video} ends early: its pictures last {end:.1f} of {length:.1f} seconds. Copy it again if you can.")
 
 
-def _upright(frame: av.VideoFrame, turn: int, shape: float = 1.0) -> Image.Image:
-    """Turn a frame upright by `turn` degrees counter-clockwise (ffmpeg's display matrix), with square pixels; `shape`
-    is the pixel aspect ratio."""
+def _display_matrix(frame: av.VideoFrame) -> tuple[float, ...]:
+    """Read a, b, c, d of the matrix by which a frame is to be shown; see TURNS."""
+    matrix = frame.side_data.get("DISPLAYMATRIX")
+    if matrix is None:
+        return AS_STORED
+    return tuple((np.frombuffer(matrix, np.int32)[[0, 1, 3, 4]] / 65536.0).round(2).tolist())
+
+
+def _picture(frame: av.VideoFrame, turn: Image.Transpose | None, shape: float = 1.0) -> Image.Image:
+    """Convert a frame to a picture with square pixels, and turn it; `shape` is the pixel aspect ratio."""
     image = tone_mapped(frame) if getattr(frame, "color_trc", None) in (PQ, HLG) else frame.to_image()
     if shape != 1.0:  # cameras of COLMAP with one focal length have square pixels
-        image = image.resize((round(image.width * shape), image.height), Image.Resampling.LANCZOS)
-    return image.rotate(turn, expand=True) if turn % 360 else image
+        image = image.resize((max(1, round(image.width * shape)), image.height), Image.Resampling.LANCZOS)
+    return image if turn is None else image.transpose(turn)
 
 
 def tone_mapped(frame: av.VideoFrame) -> Image.Image:

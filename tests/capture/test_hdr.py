@@ -7,7 +7,7 @@ import av
 import numpy as np
 import pytest
 
-from bitymi_ns.capture.video import HLG, HLG_PEAK, LUMA, PQ, TO_709, WHITE, _frames, _upright, hlg_to_nits, pq_to_nits
+from bitymi_ns.capture.video import HLG, HLG_PEAK, LUMA, PQ, TO_709, WHITE, _frames, _picture, hlg_to_nits, pq_to_nits
 
 
 def scene() -> np.ndarray:
@@ -50,8 +50,8 @@ def test_frames_are_as_bright_as_the_scene(tmp_path: Path, transfer: int) -> Non
             plane.update(rows.tobytes())
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
-    ((_, found, turn),) = _frames(path)
-    pixels = np.asarray(_upright(found, turn), np.float64) / 255.0
+    ((_, found),) = _frames(path)
+    pixels = np.asarray(_picture(found, None), np.float64) / 255.0
     error = np.abs(pixels - scene())
     assert error.max() < 0.05 and error.mean() < 0.01  # of 10 bits, in 8
     as_it_is = np.asarray(found.to_image(), np.float64) / 255.0

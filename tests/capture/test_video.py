@@ -1,3 +1,5 @@
+import re
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,8 +17,9 @@ def silent(step: str, done: int, total: int) -> None: ...
 
 
 def write_video(path: Path, frames: list[np.ndarray], rate: int = 10, times: list[int] | None = None) -> None:
-    """Write frames at a constant rate, or at these times in milliseconds."""
-    with av.open(str(path), "w") as container:
+    """Write frames at a constant rate, or at these times in milliseconds; an MP4 with its index first."""
+    options = {"movflags": "faststart"} if path.suffix == ".mp4" else {}
+    with av.open(str(path), "w", options=options) as container:
         stream = container.add_stream("mpeg4", rate=Fraction(rate))
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt, stream.bit_rate = "yuv420p", 4_000_000
@@ -28,6 +31,16 @@ def write_video(path: Path, frames: list[np.ndarray], rate: int = 10, times: lis
                 picture.pts, picture.time_base = times[i], Fraction(1, 1000)
             container.mux(stream.encode(picture))
         container.mux(stream.encode())
+
+
+def overwrite_packets(path: Path, *numbers: int) -> None:
+    """Overwrite packets of a video, counted as they lie in the file."""
+    with av.open(str(path)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    data = bytearray(path.read_bytes())
+    for begin, size in (packets[number] for number in numbers):
+        data[begin : begin + size] = bytes(size)
+    path.write_bytes(data)
 
 
 @pytest.fixture(scope="module")
@@ -93,24 +106,6 @@ def test_frames_are_taken_once(tmp_path: Path, wide: np.ndarray) -> None:
     assert extract_frames(tmp_path / "a.mp4", tmp_path, 10, silent) == folder
 
 
-def test_the_rotation_of_a_phone_is_applied(tmp_path: Path, wide: np.ndarray) -> None:
-    frames = pan(wide, [16] * 12)
-    write_video(tmp_path / "a.mp4", frames)
-    data = (tmp_path / "a.mp4").read_bytes()
-    # The matrix in the track's header (tkhd): 1 0 0, 0 1 0, 0 0 1 becomes that of a phone held upright.
-    flat = b"".join(int(v).to_bytes(4, "big", signed=True) for v in (65536, 0, 0, 0, 65536, 0, 0, 0, 1 << 30))
-    turned = b"".join(
-        int(v).to_bytes(4, "big", signed=True) for v in (0, 65536, 0, -65536, 0, 0, 240 << 16, 0, 1 << 30)
-    )
-    at = data.index(flat, data.index(b"tkhd"))
-    (tmp_path / "b.mp4").write_bytes(data[:at] + turned + data[at + len(flat) :])
-    taken = sorted(extract_frames(tmp_path / "b.mp4", tmp_path, 4, silent).iterdir())
-    picture = np.asarray(Image.open(taken[0]), float)
-    number = int(taken[0].stem.split("_")[1])
-    assert picture.shape == (320, 240, 3)
-    assert np.abs(picture - np.rot90(frames[number], -1)).mean() < 12  # turned clockwise to be seen
-
-
 def test_frames_of_a_varying_rate_are_looked_at_by_their_times(tmp_path: Path, wide: np.ndarray) -> None:
     """Half a second at 250 fps without motion, then four at 8 fps with a moving camera."""
     times = [*range(0, 500, 4), *range(500, 4500, 125)]
@@ -129,7 +124,7 @@ def test_frames_of_a_varying_rate_are_looked_at_by_their_times(tmp_path: Path, w
 def test_all_frames_of_a_clip_of_a_second_are_looked_at(tmp_path: Path, wide: np.ndarray) -> None:
     write_video(tmp_path / "a.mp4", pan(wide, [25] * 30), rate=30)
     assert len(numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, silent))) >= 20
-    with pytest.raises(CaptureError, match="holds 2 frames: film for at least ten seconds"):
+    with pytest.raises(CaptureError, match=r"has too few frames \(2\): film for ten"):
         write_video(tmp_path / "b.mp4", pan(wide, [25] * 2), rate=30)
         extract_frames(tmp_path / "b.mp4", tmp_path / "b", None, silent)
 
@@ -144,10 +139,26 @@ def test_of_a_longer_video_about_fifteen_frames_per_second_are_looked_at(
 
 
 @pytest.mark.parametrize(
-    ("matrix", "turns"), [((0, 1, -1, 0), -1), ((-1, 0, 0, -1), 2), ((0, -1, 1, 0), 1), ((1, 0, 0, 1), 0)]
+    ("matrix", "seen"),
+    [
+        ((0, 1, -1, 0), lambda frame: np.rot90(frame, -1)),
+        ((-1, 0, 0, -1), lambda frame: np.rot90(frame, 2)),
+        ((0, -1, 1, 0), lambda frame: np.rot90(frame, 1)),
+        ((1, 0, 0, 1), np.asarray),
+        ((-1, 0, 0, 1), np.fliplr),
+        ((1, 0, 0, -1), np.flipud),
+        ((0, 1, 1, 0), lambda frame: frame.swapaxes(0, 1)),
+        ((0, -1, -1, 0), lambda frame: np.rot90(frame.swapaxes(0, 1), 2)),
+        ((0, 0, 0, 0), np.asarray),
+        ((1, 1, -1, 1), np.asarray),
+    ],
 )
-def test_every_rotation_is_applied(
-    tmp_path: Path, wide: np.ndarray, matrix: tuple[int, int, int, int], turns: int
+def test_every_display_matrix_is_applied_or_named(
+    tmp_path: Path,
+    wide: np.ndarray,
+    matrix: tuple[int, int, int, int],
+    seen: Callable[[np.ndarray], np.ndarray],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     frames = pan(wide, [16] * 12)
     write_video(tmp_path / "a.mp4", frames)
@@ -156,9 +167,10 @@ def test_every_rotation_is_applied(
     stored = entries(*matrix)
     (tmp_path / "a.mp4").write_bytes(data[:at] + stored + data[at + len(stored) :])
     for path in extract_frames(tmp_path / "a.mp4", tmp_path, 4, silent).iterdir():
-        expected = np.rot90(frames[int(path.stem.split("_")[1])], turns)
+        expected = seen(frames[int(path.stem.split("_")[1])])
         picture = np.asarray(Image.open(path), float)
         assert picture.shape == expected.shape and np.abs(picture - expected).mean() < 12
+    assert ("no quarter turn or mirror" in caplog.text) is (sum(map(abs, matrix)) != 2)
 
 
 def entries(a: int, b: int, c: int, d: int) -> bytes:
@@ -184,11 +196,51 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         extract_frames(tmp_path / "a.mp4", tmp_path, None, silent)
 
 
-def test_a_video_that_breaks_off_gives_what_it_has(tmp_path: Path, wide: np.ndarray) -> None:
-    write_video(tmp_path / "a.avi", pan(wide, [16] * 40))
-    whole = (tmp_path / "a.avi").read_bytes()
-    (tmp_path / "a.avi").write_bytes(whole[: len(whole) // 2])
-    assert len(numbers(extract_frames(tmp_path / "a.avi", tmp_path, None, silent))) >= 8
+@pytest.mark.parametrize(
+    ("name", "share", "line"),
+    [
+        ("a.avi", 0.5, r"a.avi is damaged: \d+ of its 40 frames are left out"),
+        ("a.mp4", 0.5, r"a.mp4 is damaged: \d+ of its 40 frames are left out"),
+        ("a.mkv", 0.5, r"a.mkv ends early: its pictures last \d\.\d of 4\.0 seconds"),
+        ("a.mkv", 1.0, r"^$"),
+    ],
+)
+def test_a_video_that_breaks_off_gives_what_it_has(
+    tmp_path: Path, wide: np.ndarray, caplog: pytest.LogCaptureFixture, name: str, share: float, line: str
+) -> None:
+    path = tmp_path / name
+    write_video(path, pan(wide, [16] * 40))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(len(whole) * share)])
+    assert len(numbers(extract_frames(path, tmp_path, None, silent))) >= 8
+    assert re.search(line, caplog.text)
+
+
+def test_frames_behind_damage_keep_their_numbers(
+    tmp_path: Path, wide: np.ndarray, caplog: pytest.LogCaptureFixture
+) -> None:
+    frames = pan(wide, [16] * 40)
+    write_video(tmp_path / "a.mp4", frames)  # a key frame every 12
+    overwrite_packets(tmp_path / "a.mp4", 15)
+    taken = sorted(extract_frames(tmp_path / "a.mp4", tmp_path, 40, silent).iterdir())
+    assert numbers(tmp_path / "images") == [*range(15), *range(24, 40)]
+    assert "a.mp4 is damaged: 9 of its 40 frames are left out" in caplog.text
+    for path in taken:
+        assert np.abs(np.asarray(Image.open(path), float) - frames[int(path.stem.split("_")[1])]).mean() < 12
+
+
+@pytest.mark.parametrize("sizes", [[(320, 240)] * 6 + [(240, 320)] * 6, [(3000, 16)] * 12])
+def test_frames_of_any_size_are_surveyed(tmp_path: Path, wide: np.ndarray, sizes: list[tuple[int, int]]) -> None:
+    """A phone that was turned, which MPEG-TS allows, and a strip."""
+    for i, size in enumerate(dict.fromkeys(sizes)):
+        frames = pan(wide, [16] * sizes.count(size))
+        write_video(tmp_path / f"{i}.ts", [np.asarray(Image.fromarray(frame).resize(size)) for frame in frames])
+    parts = sorted(tmp_path.glob("?.ts"))
+    (tmp_path / "a.mts").write_bytes(b"".join(part.read_bytes() for part in parts))
+    assert len(_survey(tmp_path / "a.mts", silent)[0]) == 12
+    assert {Image.open(path).size for path in extract_frames(tmp_path / "a.mts", tmp_path, 12, silent).iterdir()} == {
+        *sizes
+    }
 
 
 def test_a_video_of_a_scene_gives_poses(tmp_path: Path, pictures: list[np.ndarray]) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bitymi_ns.capture.depth_normal_maps import read_depth
+from tests.capture.test_video import overwrite_packets
 from tests.captures import load_any, printed
 from tests.formats import SCANS, scanner_app, scannet, seven_scenes, stray_scanner
 
@@ -51,10 +52,13 @@ def test_a_pose_that_was_lost(capture: Path, tmp_path: Path, capsys: pytest.Capt
     assert "1 photographs of" in printed(capsys)
 
 
-def test_a_capture_of_stray_scanner(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("damaged", [False, True])
+def test_a_capture_of_stray_scanner(capture: Path, capsys: pytest.CaptureFixture[str], damaged: bool) -> None:
     one = load_any(capture, eval_mode="all").train_dataset
     frames = json.loads((capture / "transforms.json").read_text())["frames"]
     folder = stray_scanner(capture)
+    if damaged:
+        overwrite_packets(folder / "rgb.mp4", 4)
     capsys.readouterr()
     other = load_any(folder, eval_mode="all").train_dataset
     shown = [int(path.stem.removeprefix("frame_")) for path in other.image_filenames]
@@ -76,7 +80,9 @@ def test_a_capture_of_stray_scanner(capture: Path, tmp_path: Path, capsys: pytes
     poses = np.array([frame["transform_matrix"] for frame in frames])[shown]
     assert np.allclose(apart, np.linalg.norm(poses[1:, :3, 3] - poses[0, :3, 3], axis=1))  # metres stay metres
     text = printed(capsys)
-    assert "(stray-scanner, " in text and "rgb.mp4" not in text
+    assert "(stray-scanner, " in text
+    assert ("rgb.mp4 is damaged: 2 of its 12 frames are left out" if damaged else "") in text
+    assert ("rgb.mp4" in text) is damaged
     before = sorted(path.stat().st_mtime_ns for path in (folder / ".bitymi").rglob("*.jpg"))
     load_any(folder)
     assert before == sorted(path.stat().st_mtime_ns for path in (folder / ".bitymi").rglob("*.jpg"))

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.points import color_bytes, read_cloud
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.capture.transforms import MAX_SIDE

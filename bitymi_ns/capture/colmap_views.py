@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pycolmap
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.capture.find_files import FileFinder, renamed_message
 from bitymi_ns.capture.folder_contents import is_photograph, photographs_below, result_in

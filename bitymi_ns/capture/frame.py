@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.types import say, warn
 from bitymi_ns.files import write_file
 from bitymi_ns.safe_reading import read_json

@@ -5,8 +5,8 @@ import shutil
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.transforms import INTRINSICS
 from bitymi_ns.capture.types import FoundPoses

@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
-import pycolmap
 from pydantic import TypeAdapter
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.folder_contents import VIDEOS, refusal, videos_in

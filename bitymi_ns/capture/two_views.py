@@ -6,8 +6,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import numpy.typing as npt
-import pycolmap
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, read_image
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.order import natural

@@ -10,7 +10,7 @@ from pathlib import Path
 import av
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
+from PIL import Image, ImageOps
 
 from bitymi_ns.capture.cache import content_key, made_once
 from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
@@ -31,14 +31,6 @@ TRUSTED = {
     "protocol_whitelist": "file",
 }
 """FFmpeg options: a file of any name may be a list of files and URLs to read."""
-AS_STORED = (1, 0, 0, 1)
-TURNS = {
-    AS_STORED: None, (0, 1, -1, 0): Image.Transpose.ROTATE_270, (-1, 0, 0, -1): Image.Transpose.ROTATE_180,
-    (0, -1, 1, 0): Image.Transpose.ROTATE_90, (-1, 0, 0, 1): Image.Transpose.FLIP_LEFT_RIGHT,
-    (1, 0, 0, -1): Image.Transpose.FLIP_TOP_BOTTOM, (0, 1, 1, 0): Image.Transpose.TRANSPOSE,
-    (0, -1, -1, 0): Image.Transpose.TRANSVERSE,
-}  # fmt: skip
-"""Quarter turns and mirrors by a, b, c, d of a display matrix, which moves a pixel to (a x + c y, b x + d y)."""
 LEAST_SURVEYED = 60  # least number of surveyed frames: all of a clip of a second or two
 NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene, with it in view"
 PQ, HLG = 16, 18  # transfer functions of high dynamic range, as ITU-T H.273 numbers them
@@ -88,10 +80,15 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
             shape = shape if 0.25 < shape < 4.0 else 1.0
         wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
         for written, (number, frame) in enumerate(wanted_frames, 1):
-            matrix = _display_matrix(frame) if upright else AS_STORED
-            if written == 1 and matrix not in TURNS:
-                warn(f"{video} is taken as stored: its display matrix {matrix} is no quarter turn or mirror.")
-            image = _picture(frame, TURNS.get(matrix), shape)
+            image = _picture(frame, shape)
+            if upright and (matrix := frame.side_data.get("DISPLAYMATRIX")) is not None:
+                a, b, c, d = (np.frombuffer(matrix, np.int32)[[0, 1, 3, 4]] / 65536.0).round(2).tolist()
+                if (abs(a), abs(b), abs(c), abs(d)) in ((1, 0, 0, 1), (0, 1, 1, 0)):  # to x' = ax + cy, y' = bx + dy
+                    image = image if a else image.transpose(Image.Transpose.TRANSPOSE)
+                    image = ImageOps.mirror(image) if a + c < 0 else image
+                    image = ImageOps.flip(image) if b + d < 0 else image
+                elif written == 1:
+                    warn(f"{video} is taken as stored: its display matrix ({a}, {b}, {c}, {d}) is no turn or mirror.")
             image.save(folder / f"frame_{number:06d}.jpg", quality=JPEG_QUALITY, subsampling=0)
             progress("writing frames", written, len(numbers))
     return target
@@ -231,20 +228,12 @@ def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame]]:
             warn(f"{video} ends early: its pictures last {end:.1f} of {length:.1f} seconds. Copy it again if you can.")
 
 
-def _display_matrix(frame: av.VideoFrame) -> tuple[float, ...]:
-    """Read a, b, c, d of the matrix by which a frame is to be shown; see TURNS."""
-    matrix = frame.side_data.get("DISPLAYMATRIX")
-    if matrix is None:
-        return AS_STORED
-    return tuple((np.frombuffer(matrix, np.int32)[[0, 1, 3, 4]] / 65536.0).round(2).tolist())
-
-
-def _picture(frame: av.VideoFrame, turn: Image.Transpose | None, shape: float = 1.0) -> Image.Image:
-    """Convert a frame to a picture with square pixels, and turn it; `shape` is the pixel aspect ratio."""
+def _picture(frame: av.VideoFrame, shape: float = 1.0) -> Image.Image:
+    """Convert a frame to a picture with square pixels; `shape` is the pixel aspect ratio."""
     image = tone_mapped(frame) if getattr(frame, "color_trc", None) in (PQ, HLG) else frame.to_image()
     if shape != 1.0:  # cameras of COLMAP with one focal length have square pixels
         image = image.resize((max(1, round(image.width * shape)), image.height), Image.Resampling.LANCZOS)
-    return image if turn is None else image.transpose(turn)
+    return image
 
 
 def tone_mapped(frame: av.VideoFrame) -> Image.Image:

@@ -51,7 +51,7 @@ def test_frames_are_as_bright_as_the_scene(tmp_path: Path, transfer: int) -> Non
         container.mux(stream.encode(frame))
         container.mux(stream.encode())
     ((_, found),) = _frames(path)
-    pixels = np.asarray(_picture(found, None), np.float64) / 255.0
+    pixels = np.asarray(_picture(found), np.float64) / 255.0
     error = np.abs(pixels - scene())
     assert error.max() < 0.05 and error.mean() < 0.01  # of 10 bits, in 8
     as_it_is = np.asarray(found.to_image(), np.float64) / 255.0

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm.job import MAX_ERROR
 
 LINK = 15  # points seen together that link two photographs; COLMAP's least number of inliers of a pair

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.cluster.hierarchy import DisjointSet
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, NoPoses
 from bitymi_ns.capture.types import SPHERICAL_MODEL
 

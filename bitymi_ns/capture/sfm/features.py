@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-import pycolmap
-
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm.job import CameraGroup, Job, StageProgress
 from bitymi_ns.capture.types import SPHERICAL_MODEL
 

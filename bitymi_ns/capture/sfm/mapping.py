@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm import features, pairs
 from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
 from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress

@@ -4,10 +4,10 @@ from itertools import combinations
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm.job import PAIRS, Job, StageProgress
 from bitymi_ns.files import write_file
 

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pycolmap
+import pycolmap  # in this process with its signal handlers, which write the stack of a crash to the log
 
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
@@ -93,6 +93,8 @@ def main() -> None:
     job = Job.parse(sys.stdin.readline())
     threading.Thread(target=_end_with_parent, daemon=True).start()
     pycolmap.logging.minloglevel = 1  # warnings and errors
+    for level in pycolmap.logging.Level.__members__.values():
+        pycolmap.logging.set_log_destination(level, "")  # no files in the temporary folder
     np.seterr(all="ignore")
     stages = Stages()
     try:

@@ -3,11 +3,10 @@
 import os
 import re
 import struct
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from bitymi_ns import safe_reading
 from bitymi_ns.bundle.manifest import (
@@ -29,8 +28,12 @@ NOTES, NOTES_LIMIT = "notes.json", 256 << 10  # saved views and notes (`bundle.n
 CONFIG = "config.yml"  # configuration for nerfstudio's tools, not covered by the digest
 CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
 _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
-# Last records of a ZIP: ZIP64 end of directory, its locator, end of directory.
+_PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+# Records of a ZIP: a part's header, its row of the directory; ZIP64 end of directory, its locator, end of directory.
+_LOCAL, _CENTRAL = struct.Struct("<4s22xHH"), struct.Struct("<4s6xH8xLLHHH8xL")
 _LARGE, _LARGE_AT, _END = struct.Struct("<4s36xQQ"), struct.Struct("<4s4xQ4x"), struct.Struct("<4s8xLLH")
+_WIDE = 0xFFFFFFFF  # a number that stands in the row's ZIP64 field
+_SLACK = 64  # most bytes by which a part's header is longer than 30 and its name
 
 
 class MissingPart(BundleError):
@@ -69,60 +72,61 @@ def open_regular(path: Path) -> BinaryIO:
         raise BundleError(f"{path} cannot be read: {error.strerror}") from error
 
 
+class _Entry(NamedTuple):
+    """Row of a single file's directory."""
+
+    begin: int  # of the part's header
+    size: int
+    stored: bool  # as it is, not deflated
+
+
 class Parts:
     """Files of a bundle by name."""
 
-    def __init__(self, bundle: Path, archive: zipfile.ZipFile | None, size: int, inside: bool) -> None:
+    def __init__(self, bundle: Path, file: BinaryIO | None = None, inside: bool = False) -> None:
         """Prefer `parts_of`.
 
         Args:
             bundle: folder or file, also for messages.
-            archive: None for a folder.
-            size: bytes of the single file.
+            file: the opened single file; None for a folder.
             inside: refuse links out of the folder.
         """
-        self.bundle, self._archive, self._size, self._inside = bundle, archive, size, inside
+        self.bundle, self._file, self._inside = bundle, file, inside
+        self._entries, self._end = ({}, 0) if file is None else _read_directory(file)
 
     @contextmanager
-    def opened(self, name: str) -> Iterator[tuple[IO[bytes], int]]:
-        """Open a file; yield it and its size in bytes.
+    def opened(self, name: str) -> Iterator[tuple[BinaryIO, int]]:
+        """Open a file; yield it, at its beginning, and its size in bytes, at most so many of which may be read.
 
         Raises:
             BundleError: missing or unreadable.
         """
         path = self.bundle / name
-        if self._archive is None:
+        try:
+            if self._file is not None:
+                yield self._file, self._seek(self._file, name)
+                return
             with open_regular(path) as file:
                 if self._inside and os.path.dirname(os.path.realpath(path)) != os.path.realpath(self.bundle):
                     raise BundleError(f"{path} is a link that leads out of the bundle")
-                try:
-                    yield file, os.fstat(file.fileno()).st_size
-                except OSError as error:
-                    raise BundleError(f"{path} cannot be read: {error.strerror}") from error
-            return
-        entry = self._entry(name)
-        try:
-            part = self._archive.open(entry)
-        except (*_DAMAGE, ValueError) as error:
-            raise BundleError(f"{path} cannot be read: {error}") from error
-        with part:
-            try:
-                yield part, entry.file_size
-            except _DAMAGE as error:
-                raise BundleError(f"{path} cannot be read: {error}") from error
+                yield file, os.fstat(file.fileno()).st_size
+        except OSError as error:
+            raise BundleError(f"{path} cannot be read: {error.strerror}") from error
 
-    def _entry(self, name: str) -> zipfile.ZipInfo:
-        assert self._archive is not None
-        try:
-            entry = self._archive.getinfo(name)
-        except KeyError as error:
-            raise MissingPart(f"{self.bundle} has no {name}") from error
-        encrypted = entry.flag_bits & 1
-        if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size or encrypted:
+    def _seek(self, file: BinaryIO, name: str) -> int:
+        """Move to the beginning of a part of the single file, and return its size."""
+        if name not in self._entries:
+            raise MissingPart(f"{self.bundle} has no {name}")
+        begin, size, stored = self._entries[name]
+        if not stored:
             raise BundleError(f"{self.bundle}: {name} is not stored as it is")
-        if not 0 <= entry.header_offset <= self._size - entry.file_size:
-            raise BundleError(f"{self.bundle} is truncated: {name} does not lie in it")
-        return entry
+        file.seek(min(begin, self._end))
+        signature, *lengths = _LOCAL.unpack(file.read(_LOCAL.size).ljust(_LOCAL.size, b"\0"))
+        begin += _LOCAL.size + sum(lengths)
+        if signature != b"PK\3\4" or sum(lengths) > len(name) + _SLACK or begin + size > self._end:
+            raise BundleError(f"{self.bundle} is truncated or altered: {name} does not lie where its directory says")
+        file.seek(begin)
+        return size
 
     def read(self, name: str, most: int) -> bytes:
         """Read a file of at most `most` bytes; the size is checked first.
@@ -134,10 +138,6 @@ class Parts:
             if size > most:
                 raise BundleError(f"{self.bundle / name} has {size} bytes, at most {most} are read")
             return file.read(size)
-
-
-_DAMAGE = (zipfile.BadZipFile, OSError, EOFError, RuntimeError, struct.error)
-"""Errors of `zipfile` on foreign or damaged files."""
 
 
 @contextmanager
@@ -153,25 +153,21 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
     """
     path = Path(bundle)
     if not os.path.isfile(path):
-        yield Parts(path, None, 0, inside)
+        yield Parts(path, inside=inside)
         return
     with open_regular(path) as file:
         try:
-            size = _check_directory(file)
-            archive = zipfile.ZipFile(file)
-        except (*_DAMAGE, ValueError) as error:
+            parts = Parts(path, file)
+        except (OSError, ValueError) as error:
             why = instead_of(path)
             raise BundleError(f"{path} is not a bundle{f': {why}' if why else f' in one file: {error}'}") from error
-        with archive:
-            if len(archive.NameToInfo) != len(archive.filelist):
-                raise BundleError(f"{path} is not a bundle in one file: two parts have one name")
-            yield Parts(path, archive, size, inside)
+        yield parts
 
 
-def _check_directory(file: BinaryIO) -> int:
-    """Return the size of a file after checking its ZIP directory. Raises a ValueError if the directory exceeds
-    `DIRECTORY_LIMIT` (`zipfile` would take long), or if the file starts with anything else: it could then also be of
-    another type."""
+def _read_directory(file: BinaryIO) -> tuple[dict[str, _Entry], int]:
+    """Read the directory of a single file as web/src/bundle/archive.ts does: by name where the parts are said to be;
+    and where it begins. Hashes in bundle.json decide whether the parts are whole. Raises ValueError: there is none, or
+    the file does not begin with the first part, and could be of another type, too."""
     size = file.seek(0, os.SEEK_END)
     records = _LARGE.size + _LARGE_AT.size + _END.size
     file.seek(max(0, size - records))
@@ -188,8 +184,24 @@ def _check_directory(file: BinaryIO) -> int:
         raise ValueError(f"its directory has {length} bytes, at most {DIRECTORY_LIMIT} are read")
     if begin + length != size - behind:
         raise ValueError("its directory is not where its last record says")
-    file.seek(0)
-    return size
+    file.seek(begin)
+    directory, at, entries = file.read(length), 0, {}
+    while at < length:
+        row = directory[at : at + _CENTRAL.size].ljust(_CENTRAL.size, b"\0")
+        signature, method, packed, size, *lengths, offset = _CENTRAL.unpack(row)
+        at += _CENTRAL.size
+        name = directory[at : at + lengths[0]].decode("latin-1")
+        extra = directory[at + lengths[0] : at + sum(lengths[:2])]
+        at += sum(lengths)
+        if signature != b"PK\1\2" or at > length:
+            raise ValueError("its directory is damaged")
+        wide = iter(struct.unpack_from(f"<{len(extra) // 8}Q", extra, 4) if extra[:2] == b"\1\0" else ())
+        size, packed, offset = (next(wide, n) if n == _WIDE else n for n in (size, packed, offset))
+        if name in entries:
+            raise ValueError("two parts have one name")
+        if _PART.fullmatch(name):
+            entries[name] = _Entry(offset, size, method == 0 and packed == size)
+    return entries, begin
 
 
 def notes_data(parts: Parts) -> bytes | None:

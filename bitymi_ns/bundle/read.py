@@ -7,7 +7,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -104,14 +104,21 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, cr
         crop: leave out the surfels that notes.json hides.
 
     Raises:
-        BundleError: a file is missing, truncated, altered or malformed, a value is out of range, the version is too
-            new, or memory is insufficient.
+        BundleError: a file of the scene is missing, truncated, altered or malformed, a value is out of range, the
+            version is too new, or memory is insufficient. Other files are left out then, with a warning.
         NotesError: `crop`, and notes.json is refused or hides no surfels, or all.
     """
     with parts_of(folder) as parts:
         info = manifest_of(parts)
         with enough_memory(parts.bundle, info):
-            files = {name: read_file(parts, info, name, verify, name in CONTENTS) for name in info.files}
+            files = {}
+            for name in info.files:
+                try:
+                    files[name] = read_file(parts, info, name, verify, name in CONTENTS)
+                except BundleError as error:
+                    if name in CONTENTS:
+                        raise
+                    warnings.warn(f"{error}. It is left out: the scene does not need it.", stacklevel=2)
             bundle = assemble(parts.bundle, info, files, decode)
         return _cropped(bundle, parts) if crop else bundle
 
@@ -193,7 +200,7 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
     return data
 
 
-def _read_whole(file: IO[bytes], head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
+def _read_whole(file: BinaryIO, head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
     """Read a file of `size` bytes, of which `head` is read already, and feed them to `sha256`; return them if `keep`,
     else nothing."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)

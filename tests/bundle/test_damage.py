@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bitymi_ns.bundle import BundleError, read_bundle
+from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.codec.packing import pack
 from bitymi_ns.codec.quantise import encode
 from tests.bake.scenes import write
@@ -30,17 +30,17 @@ def test_damage_is_named(surfels, tmp_path):
     make(surfels, target, extra_files={"preview.png": b"picture"})
     originals = {path.name: path.read_bytes() for path in target.iterdir()}
     for name in ("surfels.ply", "atlas.ktx2", "preview.png"):
-        path = target / name
-        path.write_bytes(originals[name][:-1])
-        with pytest.raises(BundleError, match=f"{name} is truncated"):
-            read_bundle(target)
-        path.write_bytes(originals[name][:-1] + bytes([originals[name][-1] ^ 1]))
-        with pytest.raises(BundleError, match=f"{name} is altered"):
-            read_bundle(target)
-        path.unlink()
-        with pytest.raises(BundleError, match=f"{name} is missing"):
-            read_bundle(target)
-        path.write_bytes(originals[name])
+        path, whole = target / name, originals[name]
+        altered = whole[:-1] + bytes([whole[-1] ^ 1])
+        for data, problem in ((whole[:-1], "truncated"), (altered, "altered"), (None, "missing")):
+            path.unlink() if data is None else path.write_bytes(data)
+            expected = pytest.raises(BundleError, match=f"{name} is {problem}")
+            if name == "preview.png":
+                expected = pytest.warns(UserWarning, match=f"{name} is {problem}.* It is left out")
+            with expected:
+                read_bundle(target)
+            assert not all(check.ok for check in check_files(target)[1])
+        path.write_bytes(whole)
     read_bundle(target)
     (target / "bundle.json").unlink()
     with pytest.raises(BundleError, match="not a bundle"):

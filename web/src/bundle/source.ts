@@ -98,24 +98,26 @@ export class SingleFile implements Source {
       const total = Number(response.headers.get('Content-Length')) || 0;
       let done = 0;
       const whole = await bytesOf(response, name, LARGEST, (bytes) => progress((done += bytes), total));
-      const { begin, end, count } = placeOf(whole, whole.length);
-      return new SingleFile(url, entriesOf(whole.subarray(begin, end), begin, count), whole);
+      const { begin, end } = placeOf(whole, whole.length);
+      return new SingleFile(url, entriesOf(whole.subarray(begin, end), begin), whole);
     }
     const size = Number(/\/(\d+)$/.exec(response.headers.get('Content-Range') ?? '')?.[1]);
     if (!(size < LARGEST)) throw new DamagedBundle(`${name}: the server does not say how long it is.`);
     const tail = await bytesOf(response, name, TAIL, nothing);
-    const { begin, end, count } = placeOf(tail, size);
+    const { begin, end } = placeOf(tail, size);
     const from = begin - (size - tail.length); // in the tail, unless the directory is longer
     const directory =
       from >= 0
         ? tail.slice(from, from + end - begin)
         : await bytesOf(await get(url, `${begin}-${end - 1}`), name, end - begin, nothing);
-    return new SingleFile(url, entriesOf(directory, begin, count), null);
+    return new SingleFile(url, entriesOf(directory, begin), null);
   }
 
   private entry(name: string): Entry {
     const found = this.entries.get(name);
     if (!found) throw new DamagedBundle(`The bundle has no ${name}.`);
+    if (!found.stored) throw new DamagedBundle(`${name} is not stored as it is.`);
+    if (found.begin >= found.end) throw new DamagedBundle(`${name} lies beyond the end of the file.`);
     return found;
   }
 

@@ -1,5 +1,6 @@
 """Poses of every format in another convention than the file's are read as meant, as the photographs show."""
 
+import copy
 import re
 import shutil
 from collections.abc import Callable
@@ -14,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from bitymi_ns.capture import readings
 from bitymi_ns.capture.points import read_points
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.run.config import method_config
+from bitymi_ns.ply import write_cloud
 from tests.captures import edit, edit_frames, load_any, printed
 from tests.formats import JSON, SCANS, colmap, scannet, stray_scanner
 
@@ -131,8 +134,6 @@ def test_a_left_handed_world_is_mirrored_with_its_cloud(capture: Path) -> None:
     readings._decided.clear()
     of_json(capture, lambda pose: MIRROR @ pose @ MIRROR)
     cloud = capture / "sparse_pc.ply"
-    from bitymi_ns.ply import write_cloud
-
     points = read_points(cloud)[0]
     write_cloud(cloud, points.xyz * (1, 1, -1), points.rgb)
     found = load_any(capture).train_dataparser_outputs
@@ -149,10 +150,31 @@ def test_cameras_at_one_place_as_written(capture: Path) -> None:
     assert decided() == "opengl-w2c"
 
 
-def test_recorded_options(tmp_path: Path) -> None:
-    """A config.yml from before keeps the poses as written; a new one keeps what it says."""
-    now = yaml.dump(BitymiDataParserConfig(poses_as="opencv"))
-    assert yaml.load(now, yaml.UnsafeLoader).poses_as == "opencv"
-    before = "".join(line for line in now.splitlines(True) if not line.startswith("poses_as"))
-    assert yaml.load(before, yaml.UnsafeLoader).poses_as == "written"
-    assert BitymiDataParserConfig().poses_as == "auto"
+def test_a_run_records_its_reading(capture: Path, tmp_path: Path) -> None:
+    """config.yml has the reading, for commands that need no photographs and for resuming; one from before has none."""
+    of_json(capture, lambda pose: pose @ FLIP)
+
+    def configured(**options: Any) -> Any:
+        config = copy.deepcopy(method_config("bitymi").config)
+        config.pipeline.datamanager.data, config.output_dir = capture, tmp_path / "runs"
+        for name, value in options.items():
+            setattr(config, name, value)
+        config.set_timestamp()
+        return config
+
+    config = configured()
+    config.save_config()
+    path = config.get_base_dir() / "config.yml"
+    recorded = yaml.load(path.read_text(), yaml.UnsafeLoader).pipeline.datamanager.dataparser
+    assert recorded.poses_as == "opencv-c2w" and BitymiDataParserConfig().poses_as == "auto"
+    resumed = configured(load_dir=path.parent / "nerfstudio_models").pipeline.datamanager.dataparser
+    assert resumed.poses_as == "opencv-c2w"
+    shutil.rmtree(capture / "images")
+    recorded.data = capture
+    parser = recorded.setup()
+    parser.downscale_factor = 1  # how nerfstudio says that photographs are not needed
+    assert parser.get_dataparser_outputs("train").cameras.shape and parser.poses_as == "opencv-c2w"
+    path.write_text("".join(line for line in path.read_text().splitlines(True) if "poses_as" not in line))
+    assert yaml.load(path.read_text(), yaml.UnsafeLoader).pipeline.datamanager.dataparser.poses_as == "written"
+    resumed = configured(load_dir=path.parent / "nerfstudio_models").pipeline.datamanager.dataparser
+    assert resumed.poses_as == "written"

@@ -23,8 +23,8 @@ INTRINSICS = {f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2
 ENOUGH = 100  # matches that decide
 FITS = 0.5  # least share of matches that poses explain, relative to what the pairs' own poses explain
 LEAD = 2.0
-"""Least ratio of what a reading explains to what the poses explain as written: in captures that are right as written it
-is at most 0.4, in others at least 7."""
+"""Least ratio of what a reading explains to what the poses explain as written: at most 0.26 in captures that are right as
+written, at least 3.9 in others."""
 
 
 class Reading(NamedTuple):
@@ -157,7 +157,7 @@ def as_meant(
     reading, explains = decision.reading, "of what pairs of photographs have in common"
     if reading is None:
         warn(
-            f"{source}: the poses contradict the photographs: they explain {decision.written:.0%} {explains}, where "
+            f"{source}: the poses fit the photographs badly: they explain {decision.written:.0%} {explains}, where "
             f"{decision.own:.0%} can be; least in {listed(decision.worst)}. `bitymi sfm` finds poses from photographs."
         )
     if reading is None or reading == written:

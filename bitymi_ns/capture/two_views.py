@@ -125,21 +125,21 @@ def _match(cameras: Sequence[ColmapCamera], i: int, j: int, a: Features, b: Feat
     return pair if explained([pair], rays_of([pair], cameras))[0] >= max(LEAST, OWN * len(x)) else None
 
 
-def rays_of(pairs: Sequence[Pair], cameras: Sequence[ColmapCamera]) -> list[tuple[Array, Array, float]]:
-    """Compute the unit rays [n, 3] of each pair's matches in both cameras' axes (OpenCV), and the tolerance in radians;
-    `cameras` of all photographs."""
+def rays_of(pairs: Sequence[Pair], cameras: Sequence[ColmapCamera]) -> list[tuple[Array, Array, Array]]:
+    """Compute the unit rays [n, 3] of each pair's matches in both cameras' axes (OpenCV), and the tolerances [n] at the
+    second one, radians; `cameras` of all photographs."""
     lenses = {camera: camera.colmap for camera in dict.fromkeys(cameras)}
     rays = []
     for pair in pairs:
         first, second = lenses[cameras[pair.first]], lenses[cameras[pair.second]]
-        focal = second.width / (2.0 * np.pi) if second.is_spherical() else second.mean_focal_length()
-        limit = TOLERANCE * max(second.width, second.height) / focal
-        rays.append((first.cam_ray_from_img(pair.x), second.cam_ray_from_img(pair.y), limit))
+        b, step = second.cam_ray_from_img(pair.y), TOLERANCE * max(second.width, second.height) * np.eye(2)
+        limits = [np.linalg.norm(second.cam_ray_from_img(pair.y + each) - b, axis=1) for each in step]
+        rays.append((first.cam_ray_from_img(pair.x), b, np.fmin(*limits)))
     return rays
 
 
 def explained(
-    pairs: Sequence[Pair], rays: Sequence[tuple[Array, Array, float]], poses: Pose | None = None
+    pairs: Sequence[Pair], rays: Sequence[tuple[Array, Array, Array]], poses: Pose | None = None
 ) -> npt.NDArray[np.int64]:
     """Count the matches of each pair [P] whose rays, see `rays_of`, meet in front of both cameras. `poses`: [N, 4, 4]
     camera to world with OpenGL axes, of all photographs; None = the pairs' own."""

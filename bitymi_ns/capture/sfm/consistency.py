@@ -55,7 +55,7 @@ def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -
     return against / max(total, 1)
 
 
-def rays_meet(a: np.ndarray, b: np.ndarray, move: np.ndarray, limit: float) -> np.ndarray:
+def rays_meet(a: np.ndarray, b: np.ndarray, move: np.ndarray, limit: float | np.ndarray) -> np.ndarray:
     """Test [n] which pairs of unit rays [n,3], in their cameras' axes, meet in front of both. `move`: [3,4], first
     camera to second; `limit`: largest angle in radians between a ray and the plane of the other and both centres."""
     a, step = a @ move[:, :3].T, move[:, 3]

@@ -88,7 +88,7 @@ def test_right_ones_are_nothing_to_speak_of(
     place = form(capture)
     load_any(capture if place.is_relative_to(capture) else place)
     text = printed(capsys)
-    assert decided() and "poses are read as" not in text and "contradict" not in text
+    assert decided() and "poses are read as" not in text and "badly" not in text
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ EARTH = 6378137.0  # equatorial radius in metres, WGS 84
 FLATTENING = 1 / 298.257223563
 GPS_ERROR = 5.0  # of phones, metres
 LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions that determines the scale, metres
-MINIMAL, SAMPLES, STEPS = 3, 300, 3  # positions that determine a similarity, random choices of them, steps from each
+AGREEMENTS = (1.0, 2.5, GPS_ERROR, 2 * GPS_ERROR)  # distances in metres within which positions may agree
 SAME_SHAPE = 0.5  # largest error of an alignment, relative to the spread
 FILE = "frame.json"  # beside the report
 UP = (0.0, 0.0, 1.0)  # up in the world frame
@@ -148,27 +148,21 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
     shape = np.linalg.svd(centers - centers.mean(axis=0), compute_uv=False)
     if spread[0] < LEAST_SPREAD or spread[1] < LEAST_SPREAD / 2 or shape[1] < 0.05 * shape[0]:
         return None
-    rng, best, least = np.random.default_rng(0), None, np.inf
-    half = min(len(positions), max(len(positions) // 2, MINIMAL + 2))  # the others may be of another flight
-    for _ in range(SAMPLES):  # least trimmed squares
-        closest = rng.choice(len(positions), MINIMAL, replace=False)
-        for _ in range(STEPS):
-            found = pycolmap.estimate_sim3d(centers[closest], positions[closest])
-            if found is None:
-                break
-            errors = _gps_errors(found, centers, positions)
-            closest = np.argsort(errors)[:half]
-            if (total := np.square(errors[closest]).sum()) < least:
-                best, least = errors, total
-    if best is None:
-        return None
-    agree = best <= np.clip(3 * np.sort(best)[half - 1], GPS_ERROR, 2 * GPS_ERROR)
-    if 2 * agree.sum() < len(agree):
-        warn(f"GPS is not used: at most {agree.sum()} of {len(agree)} photographs agree on it to {2 * GPS_ERROR:g} m.")
-        return None
-    similarity = pycolmap.estimate_sim3d(centers[agree], positions[agree])
-    fits = np.median(_gps_errors(similarity, centers, positions)[agree]) < SAME_SHAPE * spread[0]
-    return (similarity, agree) if fits else None
+    options = pycolmap.RANSACOptions(random_seed=0)
+    for error in AGREEMENTS:  # the least within which half agree: others may be of another flight
+        options.max_error = error
+        found = pycolmap.estimate_sim3d_robust(centers, positions, options)
+        if found is None:
+            continue
+        similarity = found["tgt_from_src"] if isinstance(found, dict) else found  # as pycolmap 4.1 and 4.2 have it
+        errors = _gps_errors(similarity, centers, positions)
+        if 2 * (errors <= error).sum() >= len(errors):
+            agree = errors <= 2 * error  # with those that noise puts farther away
+            similarity = pycolmap.estimate_sim3d(centers[agree], positions[agree])
+            same_shape = np.median(_gps_errors(similarity, centers, positions)[agree]) < SAME_SHAPE * spread[0]
+            return (similarity, agree) if same_shape else None
+    warn(f"GPS is not used: fewer than half of {len(positions)} photographs agree on it to {AGREEMENTS[-1]:g} m.")
+    return None
 
 
 def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray | None) -> pycolmap.Sim3d:

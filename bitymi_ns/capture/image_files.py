@@ -16,7 +16,7 @@ from PIL import EpsImagePlugin, ExifTags, Image, ImageCms
 
 from bitymi_ns.capture.exif import exif_stops, exposure_settings
 from bitymi_ns.capture.folder_contents import open_picture
-from bitymi_ns.capture.types import fail, parsing, warn
+from bitymi_ns.capture.types import fail, parsing
 from bitymi_ns.trust import listed
 
 S, T = TypeVar("S"), TypeVar("T")
@@ -120,16 +120,6 @@ def check_sizes(paths: Sequence[Path]) -> None:
 def _too_large(paths: Sequence[Path]) -> str:
     camera = "w, h, fl_x, fl_y, cx and cy of its camera"
     return f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and {camera} with it."
-
-
-def check_orientation(paths: Sequence[Path]) -> None:
-    """Warn of photographs with an EXIF orientation, which is ignored."""
-    turned = [path for path, value in zip(paths, in_threads(orientation, paths), strict=True) if value != 1]
-    if turned:
-        warn(
-            f"{listed(turned)} has an EXIF tag that asks viewers to turn the photograph. It is used as it is stored. "
-            "If the pose is that of the turned picture, turn the pixels (`mogrify -auto-orient <photos>`)."
-        )
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:

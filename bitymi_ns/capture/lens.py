@@ -15,7 +15,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say, warn
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say
 
 MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
 NODE_STEP = 4  # pixels between the nodes of the distortion; interpolating between them is far more exact than a pixel
@@ -37,7 +37,7 @@ SAMPLES = 2  # samples along a side of a face's pixel: one would alias where pho
 BAND = 256  # rows of a face that are resampled together
 PAD = 2  # columns by which a 360-degree picture is continued at each side, from the other side
 CACHED_MAPS = 4  # lenses whose remapping tables are cached; 72 MB for 12 megapixels
-DOUBTFUL_AREA, ABSURD_AREA = 0.25, 0.05  # warn or fail if undistorting leaves a smaller share of the photograph
+ABSURD_AREA = 0.05  # fail if undistorting leaves a smaller share of the photograph
 
 
 class Pinhole(NamedTuple):
@@ -199,8 +199,6 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
             f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting would "
             f"leave {100.0 * share:.2g} % of the picture. Correct it, or calibrate a simpler model (SIMPLE_RADIAL)."
         )
-    if share < DOUBTFUL_AREA:
-        warn(f"Undistorting leaves only {100.0 * share:.2g} % of {label}. The lens distortion may be wrong.")
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
     across, down = pinhole.view
     if max(across, down) > MAX_VIEW_ANGLE - 0.5:

@@ -1,18 +1,31 @@
-"""Decide by the photographs how poses and intrinsics of a capture are to be read."""
+"""Decide by the photographs how poses and intrinsics of a capture are to be read: match pairs of photographs without
+their poses, and count the matches that each reading explains."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
-from itertools import product
+from itertools import combinations, product
+from operator import ne
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.cache import content_key
-from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, Photograph, Pose, fail, warn
+from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, read_image
+from bitymi_ns.capture.masks import checked_mask
+from bitymi_ns.capture.order import natural
+from bitymi_ns.capture.sfm.consistency import rays_meet
+from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, CaptureError, ColmapCamera, Photograph, fail, warn
+from bitymi_ns.ranges import spread
 from bitymi_ns.trust import listed
 
+Array = npt.NDArray[np.float64]
+Features = tuple[Array, npt.NDArray[np.float32]]
+"""Positions [n, 2] in pixels of the camera, and descriptors [n, 128] of length 1."""
 AUTO, WRITTEN = "auto", "written"
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 CAMERA_AXES = {"opengl": np.eye(4), "opencv": OPENCV_AXES, "lefthanded": MIRROR}
@@ -23,8 +36,19 @@ INTRINSICS = {f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2
 ENOUGH = 100  # matches that decide
 FITS = 0.5  # least share of matches that poses explain, relative to what the pairs' own poses explain
 LEAD = 2.0
-"""Least ratio of what a reading explains to what the poses explain as written: at most 0.26 in captures that are right as
+"""Least ratio of what a reading explains to what poses explain as written: at most 0.26 in captures that are right as
 written, at least 3.9 in others."""
+CLIPS, CLIP = 6, 6  # runs of photographs that are consecutive by name, and photographs of each
+SIDE = 500  # longer side that photographs are reduced to, pixels; twice as much of 360-degree pictures
+FEATURES, COARSE = 1500, 128  # features of a photograph; largest ones that decide on likeness
+RATIO = 0.8  # most ratio of the distances of a feature's nearest and second nearest
+PAIRS, TRIALS = 20, 80  # pairs wanted, and pairs matched at most
+ALIKE = 8  # least matches of coarse features of a pair that is not near by name
+LEAST, OWN = 15, 0.4  # least matches of a pair, and share of them, that its own essential matrix explains
+SAMPLES = 1000  # random samples in the search for that matrix, at most
+MOTION = 0.05  # least median motion between the photographs of a pair, in longer sides
+TOLERANCE = 0.004  # largest distance to the epipolar plane, in longer sides; matches that move less tell nothing
+STILL = 1e-4  # baseline, relative to the largest coordinate of a camera, below which cameras are at one place
 
 
 class Reading(NamedTuple):
@@ -46,12 +70,10 @@ def readings(own: Reading) -> list[Reading]:
     """List the readings of a format with its `own` convention, those that differ least first."""
     orders = ("xyzw", "wxyz") if own.order else ("",)
     every = product(CAMERA_AXES, ("c2w", "w2c"), orders, TURNS, ("", *INTRINSICS, SWAPPED, NO_DISTORTION))
-    return sorted(
-        (Reading(*each) for each in every), key=lambda each: sum(a != b for a, b in zip(each, own, strict=True))
-    )
+    return [Reading(*each) for each in sorted(every, key=lambda each: sum(map(ne, each, own)))]
 
 
-def read_as(poses: Pose, own: Reading, reading: Reading) -> tuple[Pose, Pose]:
+def read_as(poses: Array, own: Reading, reading: Reading) -> tuple[Array, Array]:
     """Convert poses [N, 4, 4], camera to world with OpenGL axes by a format's `own` convention, to those of a reading;
     also return the reflection [4, 4] of their world if that was left-handed, else the identity."""
     if reading[:4] == own[:4]:
@@ -65,8 +87,7 @@ def read_as(poses: Pose, own: Reading, reading: Reading) -> tuple[Pose, Pose]:
     matrices = np.linalg.inv(matrices) if reading.direction == "w2c" else matrices
     matrices = matrices @ CAMERA_AXES[reading.axes]
     mirrored = reading.axes == "lefthanded" and np.median(np.linalg.det(matrices)) < 0.0
-    world = MIRROR if mirrored else np.eye(4)
-    turn = np.eye(4)
+    world, turn = MIRROR if mirrored else np.eye(4), np.eye(4)
     turn[:3, :3] = Rotation.from_euler("z", TURNS[reading.turn], degrees=True).as_matrix().round()
     return world @ matrices @ turn, world
 
@@ -84,6 +105,118 @@ def camera_as(camera: ColmapCamera, kind: str) -> ColmapCamera:
     return camera._replace(params=tuple(params.tolist()))
 
 
+class Pair(NamedTuple):
+    """Matches of two photographs, by their indices, in pixels [n, 2] of their cameras."""
+
+    first: int
+    second: int
+    x: Array
+    y: Array
+    own: Array  # [3, 4] pose of the second camera against the first one's that explains most matches
+
+
+def match_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
+    """Match pairs of photographs that are near by name or look alike, and move; their poses are not used."""
+    order = sorted(range(len(photographs)), key=lambda i: natural(str(photographs[i].file)))
+    if len(order) > CLIPS * CLIP:
+        order = [order[i + k] for i in spread(len(order) - CLIP + 1, CLIPS) for k in range(CLIP)]
+    order = list(dict.fromkeys(order))
+    features = in_threads(lambda i: _features(photographs[i]), order)
+    near, wide = [], []
+    for i, j in combinations(range(len(order)), 2):
+        if j <= i + 2:
+            near.append((i, j))
+        elif len(_mutual(features[i][1][:COARSE], features[j][1][:COARSE])) >= ALIKE:
+            wide.append((i, j))
+    rng, pairs = np.random.default_rng(0), []
+    tried = [
+        (k * every, *some[i])
+        for every, some in ((1, near), (2, wide))
+        for k, i in enumerate(rng.permutation(len(some)))
+    ]
+    for _, i, j in sorted(tried)[:TRIALS]:
+        if len(pairs) < PAIRS:
+            pairs += _match([each.camera for each in photographs], order[i], order[j], features[i], features[j])
+    return pairs
+
+
+def _features(photograph: Photograph) -> Features:
+    """Find SIFT features, the largest first, with square roots of the histograms as descriptors (Arandjelovic and
+    Zisserman, 2012); none if the photograph cannot be read, or not with its camera, which is reported later."""
+    camera, found, mask = photograph.camera, (), None
+    side = SIDE * (2 if camera.model == SPHERICAL_MODEL else 1)
+    size = tuple(max(1, round(each * min(1.0, side / max(camera.size)))) for each in camera.size)
+    with suppress(CaptureError):
+        image = np.asarray(read_image(photograph.file, wanted=size).convert("L"))
+        if photograph.mask is not None:
+            mask = np.asarray(checked_mask(photograph.mask).resize(size), np.uint8)
+        if in_proportion(image_size(photograph.file) or (0, 1), camera.size):
+            found, values = cv2.SIFT_create(FEATURES, contrastThreshold=0.02).detectAndCompute(image, mask)
+    if not found:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    largest = np.argsort([-each.size for each in found], kind="stable")
+    values = np.sqrt(values[largest] / np.maximum(values[largest].sum(1, keepdims=True), 1e-6))
+    return (np.array([each.pt for each in found])[largest] + 0.5) * np.divide(camera.size, size), values
+
+
+def _mutual(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
+    """Match features [n, 128] and [m, 128], each the other's nearest by far; return their indices [k, 2]."""
+    if min(len(a), len(b)) < 2:
+        return np.zeros((0, 2), np.int64)
+    cosine = a @ b.T
+    rows, there = np.arange(len(a)), cosine.argmax(1)
+    mutual = cosine.argmax(0)[there] == rows
+    best = cosine[rows, there]
+    cosine[rows[mutual], there[mutual]] = -1.0
+    second = np.maximum(cosine.max(1), cosine.max(0)[there])
+    kept = mutual & (1.0 - best < RATIO**2 * (1.0 - second))
+    return np.stack([rows[kept], there[kept]], 1)
+
+
+def _match(cameras: Sequence[ColmapCamera], i: int, j: int, a: Features, b: Features) -> list[Pair]:
+    """Match two photographs; none = too few matches, or too little motion."""
+    matched = _mutual(a[1], b[1])
+    x, y = a[0][matched[:, 0]], b[0][matched[:, 1]]
+    motion = np.linalg.norm(x / max(cameras[i].size) - y / max(cameras[j].size), axis=1)
+    moves = motion > TOLERANCE
+    x, y = x[moves], y[moves]
+    if len(x) < LEAST or np.median(motion[moves]) < MOTION:
+        return []
+    options = pycolmap.RANSACOptions(max_num_trials=SAMPLES, random_seed=0)
+    options.max_error = TOLERANCE * max(cameras[i].size)
+    found = pycolmap.estimate_essential_matrix(x, y, cameras[i].colmap, cameras[j].colmap, options)
+    pair = [] if found is None else [Pair(i, j, x, y, found["cam2_from_cam1"].matrix())]
+    return pair if explained(pair, rays_of(pair, cameras)).sum() >= max(LEAST, OWN * len(x)) else []
+
+
+def rays_of(pairs: Sequence[Pair], cameras: Sequence[ColmapCamera]) -> list[tuple[Array, Array, Array]]:
+    """Compute the unit rays [n, 3] of each pair's matches in both cameras' axes (OpenCV), and the tolerances [n] at the
+    second one, radians; `cameras` of all photographs."""
+    lenses = {camera: camera.colmap for camera in dict.fromkeys(cameras)}
+    rays = []
+    for pair in pairs:
+        first, second = lenses[cameras[pair.first]], lenses[cameras[pair.second]]
+        b, step = second.cam_ray_from_img(pair.y), TOLERANCE * max(second.width, second.height) * np.eye(2)
+        limits = [np.linalg.norm(second.cam_ray_from_img(pair.y + each) - b, axis=1) for each in step]
+        rays.append((first.cam_ray_from_img(pair.x), b, np.fmin(*limits)))
+    return rays
+
+
+def explained(
+    pairs: Sequence[Pair], rays: Sequence[tuple[Array, Array, Array]], poses: Array | None = None
+) -> npt.NDArray[np.int64]:
+    """Count the matches of each pair [P] whose rays, see `rays_of`, meet in front of both cameras. `poses`: [N, 4, 4]
+    camera to world with OpenGL axes, of all photographs; None = the pairs' own."""
+    counts = np.zeros(len(pairs), np.int64)
+    to_world = np.eye(4)[None] if poses is None else poses @ OPENCV_AXES
+    to_camera, least = np.linalg.inv(to_world), STILL * np.abs(to_world[:, :3, 3]).max()
+    for k, (pair, (a, b, limit)) in enumerate(zip(pairs, rays, strict=True)):
+        move = pair.own if poses is None else (to_camera[pair.second] @ to_world[pair.first])[:3]
+        if np.linalg.norm(move[:, 3]) > least:  # without a baseline every match would lie in the plane
+            counts[k] = rays_meet(a, b, move, limit).sum()
+    return counts
+
+
 class Decision(NamedTuple):
     """Reading that the photographs ask for (None = none explains them), and shares of matches that are explained."""
 
@@ -94,25 +227,23 @@ class Decision(NamedTuple):
     worst: tuple[str, ...] = ()  # photographs whose matches are explained least
 
 
-def decide(photographs: Sequence[Photograph], poses: Pose, written: Reading) -> Decision:
+def decide(photographs: Sequence[Photograph], poses: Array, written: Reading) -> Decision:
     """Find the reading by which the poses explain by far most of what pairs of photographs have in common; as written
     if there is too little of that, or a camera cannot be used."""
-    from bitymi_ns.capture import two_views  # slow to import
-
     cameras, every = [each.camera for each in photographs], readings(written)
     lenses = [camera.colmap for camera in dict.fromkeys(cameras)]
     focals = [value for lens in lenses for value in lens.params[lens.focal_length_idxs()]]
     usable = all(np.isfinite(lens.params).all() for lens in lenses) and min(focals, default=1.0) > 0.0
-    pairs = two_views.match_pairs(photographs) if usable else []
-    own, total = two_views.explained(pairs, two_views.rays_of(pairs, cameras)), sum(len(pair.x) for pair in pairs)
+    pairs = match_pairs(photographs) if usable else []
+    own, total = explained(pairs, rays_of(pairs, cameras)), sum(len(pair.x) for pair in pairs)
     if own.sum() < ENOUGH:
         return Decision(written)
     counts: dict[Reading, npt.NDArray[np.int64]] = {}
     for kinds in ([""], [*INTRINSICS, SWAPPED, NO_DISTORTION]):
         for kind in kinds:
-            rays = two_views.rays_of(pairs, [camera_as(camera, kind) for camera in cameras])
+            rays = rays_of(pairs, [camera_as(camera, kind) for camera in cameras])
             some = [each for each in every if each.intrinsics == kind]
-            counts |= {each: two_views.explained(pairs, rays, read_as(poses, written, each)[0]) for each in some}
+            counts |= {each: explained(pairs, rays, read_as(poses, written, each)[0]) for each in some}
         best = max(counts, key=lambda each: counts[each].sum())
         share, as_written, most = (float(each.sum() / total) for each in (counts[best], counts[written], own))
         if share >= max(FITS * most, LEAD * as_written):
@@ -130,20 +261,13 @@ _decided: dict[str, Decision] = {}  # commands read a capture twice: to check it
 
 
 def as_meant(
-    photographs: Sequence[Photograph], written: Reading, frame: Pose, source: str, asked: str
-) -> tuple[list[Photograph], Pose, str]:
-    """Give photographs the poses and intrinsics of a reading, and say so.
+    photographs: Sequence[Photograph], written: Reading, frame: Array, source: str, asked: str
+) -> tuple[list[Photograph], Array, str]:
+    """Give photographs the poses and intrinsics of the reading `asked` for (AUTO = the photographs decide), and say so.
+    `frame`: transform [4, 4] from the world of the files to that of the photographs.
 
-    Args:
-        written: convention of the format.
-        frame: transform [4, 4] from the world of its files to that of the photographs.
-        asked: name of the reading, WRITTEN, or AUTO: the photographs decide.
-
-    Returns:
-        photographs, the reflection [4, 4] of their world (the identity unless it was left-handed), and the name.
-
-    Raises:
-        CaptureError: the format has no such reading.
+    Returns the photographs, the reflection [4, 4] of their world (the identity unless it was left-handed), and the
+    reading's name. Raises CaptureError: the format has no such reading.
     """
     named = {WRITTEN: written} | {each.name: each for each in readings(written)}
     poses, decision = np.linalg.inv(frame) @ np.stack([each.pose for each in photographs]), Decision(named.get(asked))

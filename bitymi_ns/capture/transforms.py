@@ -27,7 +27,7 @@ from bitymi_ns.capture.masks import with_masks
 from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
 from bitymi_ns.capture.recognise import SPLITS
 from bitymi_ns.capture.splits import NameLists
-from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say, warn
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import listed
 
@@ -136,7 +136,6 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
         _check_frames(path, meta, own_format)
         if own_format:
             _check_intrinsics(path, meta)
-            _warn_of_contradictions(path, meta)
         _check_applied(path, meta)
         _check_lists(path, meta)
         correct_poses(path, meta["frames"])
@@ -207,18 +206,6 @@ def stated_model(meta: dict[str, Any], frame: dict[str, Any]) -> Any:
         if any(key in holder for key in ("is_fisheye", "fisheye")):
             return "OPENCV_FISHEYE" if holder.get("is_fisheye") or holder.get("fisheye") else "OPENCV"
     return "OPENCV"
-
-
-def _warn_of_contradictions(path: Path, meta: dict[str, Any]) -> None:
-    """Warn if frames state another camera than the file does for all; the frame's is used."""
-    differing: list[str] = []
-    for group in (*((key,) for key in INTRINSICS), DISTORTION):
-        common = {key: meta[key] for key in group if key in meta}
-        own = [{key: frame[key] for key in group if key in frame} for frame in meta["frames"]]
-        if common and any(values not in ({}, common) for values in own):
-            differing.extend(common)
-    if differing:
-        warn(f"{path} gives {', '.join(differing)} for all frames and for single ones: those of the frame are used.")
 
 
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:

@@ -126,8 +126,3 @@ def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
 def test_cameras_that_cannot_be_used(model: str, params: tuple[float, ...], message: str) -> None:
     with refused(message):
         lenses_of(ColmapCamera(model, *SIZE, params), SIZE, "camera 1")
-
-
-def test_little_that_is_left_is_said(reported: list[str]) -> None:
-    lenses_of(RADIAL._replace(params=(80.0, 48.0, 36.0, -6.0)), SIZE, "camera 1")
-    assert "of camera 1. The lens distortion may be wrong" in reported[0]

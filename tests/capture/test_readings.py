@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture import readings, two_views
+from bitymi_ns.capture import readings
 from bitymi_ns.capture.readings import (
     CAMERA_AXES,
     INTRINSICS,
@@ -40,25 +40,25 @@ def photographs(arc: Path, views: Sequence[RoomView]) -> list[Photograph]:
 
 
 @pytest.fixture(scope="session")
-def pairs(photographs: list[Photograph]) -> list[two_views.Pair]:
-    return two_views.match_pairs(photographs)
+def pairs(photographs: list[Photograph]) -> list[readings.Pair]:
+    return readings.match_pairs(photographs)
 
 
 @pytest.fixture
-def matched(pairs: list[two_views.Pair], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(two_views, "match_pairs", lambda photographs: pairs)
+def matched(pairs: list[readings.Pair], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(readings, "match_pairs", lambda photographs: pairs)
 
 
-def explained(pairs: list[two_views.Pair], photographs: list[Photograph], poses: np.ndarray | None = None) -> int:
-    rays = two_views.rays_of(pairs, [each.camera for each in photographs])
-    return int(two_views.explained(pairs, rays, poses).sum())
+def explained(pairs: list[readings.Pair], photographs: list[Photograph], poses: np.ndarray | None = None) -> int:
+    rays = readings.rays_of(pairs, [each.camera for each in photographs])
+    return int(readings.explained(pairs, rays, poses).sum())
 
 
 def poses_of(photographs: Sequence[Photograph]) -> np.ndarray:
     return np.stack([each.pose for each in photographs])
 
 
-def test_matches_need_no_poses(photographs: list[Photograph], pairs: list[two_views.Pair]) -> None:
+def test_matches_need_no_poses(photographs: list[Photograph], pairs: list[readings.Pair]) -> None:
     """Matches are many, of near and wide pairs, and poses explain nearly all that the pairs' own explain."""
     assert len(pairs) >= 10 and {pair.second - pair.first > 2 for pair in pairs} == {False, True}
     own, total = explained(pairs, photographs), sum(len(pair.x) for pair in pairs)

@@ -154,7 +154,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         every = list(dict.fromkeys([*files[0], *files[1]]))
         check_photographs_exist(self.get_datapath(), every)
         image_files.check_sizes(every)
-        image_files.check_orientation(every)
         self._duplicates = splits.duplicate_files(*files)
         splits.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":

@@ -55,10 +55,7 @@ def test_a_name_as_long_as_the_system_allows(capture: Path) -> None:
     assert "mask" in load(capture).cached_train[0]
 
 
-def test_a_frame_with_a_camera_of_its_own(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    edit(capture, lambda meta: meta["frames"][5].update(w=meta["w"], fl_x=meta["fl_x"]))
-    load(capture)
-    assert "single ones" not in printed(capsys)
+def test_a_frame_with_a_camera_of_its_own(capture: Path) -> None:
     path = images_of(capture)[5]
     Image.open(path).resize((96, 72)).save(path)
     own = {"w": 96, "h": 72, "fl_x": 80.0, "fl_y": 81.0, "cx": 48.0, "cy": 36.0, "k1": 0.01}
@@ -69,8 +66,6 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path, capsys: pytest.CaptureF
     assert train.metadata["lenses"][index].camera.size == (96, 72) and int(train.cameras.width[index - 1]) == 48
     assert float(train.cameras.fy[index]) == 81.0 and float(train.cameras.fy[index - 1]) != 81.0
     assert [lens.distorts for lens in train.metadata["lenses"][index - 1 : index + 1]] == [False, True]
-    message = printed(capsys)
-    assert "for all frames and for single ones: those of the frame are used" in message and "w, h, fl_x" in message
     assert len(manager.cached_train) == 10
 
 

@@ -59,6 +59,7 @@ class Sfm:
 
     def run(self) -> None:
         from bitymi_ns.capture.folder_contents import passed_over
+        from bitymi_ns.capture.frame import gps_line
         from bitymi_ns.capture.nerfstudio import write_capture
         from bitymi_ns.capture.poses import find_poses
         from bitymi_ns.progress import rich_progress
@@ -76,6 +77,8 @@ class Sfm:
             f"{poses.registered} of {poses.given} photographs have a pose; mean reprojection error "
             f"{poses.reprojection_error:.2f} pixels. Report: {(self.output or poses.report) / 'report.md'}"
         )
+        if by_gps := gps_line(poses.report):
+            say(by_gps)
         if poses.doubt:
             say(poses.doubt, sys.stderr)
         say(f"Wrote {self.output}" if self.output else f"COLMAP model: {poses.model}")

@@ -22,7 +22,7 @@ Kind = Literal["poses", "points", "frames"]
 """Content of a work folder, and the start of its name: poses, points of known poses, or frames of a video with known
 poses. A file of that name marks the latter two as complete."""
 IN_USE = ".in-use-"  # prefix of the locks of reading processes
-VERSION = 5  # increase to invalidate cached poses when equal input gives others
+VERSION = 6  # increase to invalidate cached poses when equal input gives others
 
 
 def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.types import say, warn
+from bitymi_ns.capture.types import warn
 from bitymi_ns.files import write_file
 from bitymi_ns.safe_reading import read_json
 
@@ -37,6 +37,7 @@ class WorldFrame:
     gps_error: float | None  # median distance of cameras from GPS positions that agree, metres
     gps_positions: int  # photographs with a position
     transform: list[list[float]]  # [3, 4] from COLMAP's world, with scale
+    gps_agreeing: int = 0  # photographs whose positions agree
 
 
 def write_frame(folder: Path, frame: WorldFrame) -> None:
@@ -53,6 +54,15 @@ def read_frame(folder: Path) -> WorldFrame | None:
     length = frame.metres_per_unit
     known = length is None or (isinstance(length, (int, float)) and 0 < length < math.inf)
     return frame if known and frame.up in SOURCES else None
+
+
+def gps_line(folder: Path) -> str:
+    """Describe what the world of a model has from GPS, by frame.json in a folder; empty = nothing."""
+    frame = read_frame(folder)
+    if frame is None or frame.gps_error is None:
+        return ""
+    agree = f"{frame.gps_agreeing} of {frame.gps_positions} photographs with a position agree"
+    return f"GPS makes the world, in metres: {agree}, with a median error of {frame.gps_error:.1f} m."
 
 
 def local_positions(
@@ -104,8 +114,7 @@ def move_to_world(
             source, similarity = "gravity", pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
         model.transform(similarity)
         error = float(np.median(_gps_errors(similarity, placed, positions)[agree]))
-        say(f"GPS makes the world: {agree.sum()} of {len(agree)} photographs with a position agree to {error:.1f} m.")
-        return WorldFrame(source, 1.0, origin, error, len(local), similarity.matrix().tolist())
+        return WorldFrame(source, 1.0, origin, error, len(local), similarity.matrix().tolist(), int(agree.sum()))
     similarity = _by_up(model, np.array(list(centers.values())), up)
     model.transform(similarity)
     source = "cameras" if up is None else "gravity"

@@ -12,6 +12,7 @@ from typing import Any
 from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.colmap_views import Origin, Source, find_masks, make_source
 from bitymi_ns.capture.folder_contents import passed_over, videos_in
+from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.sfm_photos import photo_folder
@@ -63,6 +64,8 @@ def find_sfm_source(
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
         f"pixels; how they were found is in {poses.report}."
     )
+    if by_gps := gps_line(poses.report):
+        say(by_gps)
     if poses.doubt:
         warn(poses.doubt)
     masks = _masks(found, masks_path, downscale)

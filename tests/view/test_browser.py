@@ -151,10 +151,36 @@ def test_a_shared_link_brings_the_same_picture(bundle: Path, tmp_path: Path) -> 
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
 
 
+HIDE = "Object.defineProperty(Navigator.prototype, 'gpu', { value: undefined })"
+NO_ADAPTER = "Object.defineProperty(Navigator.prototype, 'gpu', { value: { requestAdapter: () => null } })"
+
+
 def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None:
-    hide = "Object.defineProperty(Navigator.prototype, 'gpu', { value: undefined })"
-    _, text = page_of(site_of(bundle), ["init", hide])
+    _, text = page_of(site_of(bundle), ["init", HIDE])
     assert "no WebGPU" in text and "Update the browser" in text
+
+
+@pytest.mark.parametrize(("script", "why"), [(HIDE, "no WebGPU"), (NO_ADAPTER, "No graphics device")])
+@pytest.mark.parametrize("pictures", [{"preview.jpg": 64, "poster.webp": 32}, {"preview.jpg": 0, "poster.webp": 32}])
+def test_without_webgpu_the_preview_is_shown_or_else_the_poster(
+    bundle: Path, script: str, why: str, pictures: dict[str, int]
+) -> None:
+    for name, side in pictures.items():
+        image = Image.new("RGB", (side or 1, side or 1), (200, 30, 30))
+        image.save(bundle / name) if side else (bundle / name).write_bytes(b"no picture")
+    amend(bundle, lambda info: info["files"].update({name: stated(bundle / name) for name in pictures}))
+    width = "document.getElementById('poster').naturalWidth"
+    shown = "document.getElementById('poster').hidden"
+    steps = [["until", f"{STATE} === 'picture'"], ["ask", "document.body.innerText"], ["ask", width], ["ask", shown]]
+    with served(site_of(bundle)) as address:
+        found = drive([["init", script], ["goto", address], *steps], SCREEN, drawn=False)
+    text, size, hidden = found.results[-3:]
+    assert why in text and "A picture of the scene is shown." in text and "Update the browser" not in text
+    assert size == (pictures["preview.jpg"] or pictures["poster.webp"]) and hidden is False
+
+
+def stated(path: Path) -> dict[str, object]:
+    return {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
 @pytest.mark.parametrize("damage", ["altered", "newer"])

@@ -9,6 +9,9 @@ export class ViewerError extends Error {
   }
 }
 
+// Nothing here can draw: the page shows a picture, if the bundle has one.
+export class NoGraphics extends ViewerError {}
+
 // Memory of the device or the browser is exceeded.
 export const tooLarge = (detail: string): ViewerError =>
   new ViewerError('This scene is too large for this device', detail, 'Open it on a device with more memory.');

@@ -3,10 +3,10 @@ import './ui/style.css';
 import './ui/notes.css';
 import { App } from './app';
 import { type Bundle, loadBundle, loadManifest } from './bundle/load';
-import { loadPoster } from './bundle/poster';
+import { loadPoster, loadPreview } from './bundle/poster';
 import { BESIDE, Folder, SingleFile, type Source } from './bundle/source';
 import { Embed } from './embed';
-import { ViewerError } from './errors';
+import { NoGraphics, ViewerError } from './errors';
 import { type Graphics, openDevice, watch } from './render/device';
 import { checkRoom } from './render/limits';
 import { Programs } from './render/programs';
@@ -14,7 +14,7 @@ import { Renderer } from './render/renderer';
 import { SceneOnDevice } from './render/scene';
 import { screenOf } from './render/screen';
 import { element } from './ui/dom';
-import { notify, onError, showError, showPoster, showProgress, showScene } from './ui/pages';
+import { notify, onError, showError, showInstead, showPoster, showProgress, showScene } from './ui/pages';
 import { type Notes, noNotes, parseNotes } from './view/notes';
 import { fromHash } from './view/share';
 
@@ -57,6 +57,7 @@ async function notesOf(from: Source, stated: boolean): Promise<Notes> {
 async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promise<Bundle> {
   const from = await opened;
   const info = await loadManifest(from);
+  await Promise.race([opening, null]); // where nothing can draw, nothing more is fetched
   if (!fromHash(location.hash)) void loadPoster(from, info).then(showPoster);
   return loadBundle(from, info, showProgress, async () => {
     const { deviceMemory } = navigator as { deviceMemory?: number }; // not in all browsers
@@ -64,9 +65,20 @@ async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promis
   });
 }
 
+// Shows a picture of the scene where nothing can draw it.
+async function drawNothing(error: NoGraphics, opened: Promise<Source>): Promise<void> {
+  const from = await opened;
+  const info = await loadManifest(from);
+  const pictures = [await loadPreview(from, info), await loadPoster(from, info)];
+  await showInstead(error, pictures, (await about()).title);
+}
+
 async function main(): Promise<void> {
   const opening = openDevice();
   const opened = source();
+  opening.catch((error: unknown) => {
+    if (error instanceof NoGraphics) drawNothing(error, opened).catch(showError);
+  });
   const loading = load(opened, opening);
   loading.catch(() => undefined); // handled where it is awaited
   const graphics = await opening;
@@ -100,4 +112,4 @@ document.documentElement.dataset.state = 'loading';
 element('page-late').hidden = true;
 addEventListener('unhandledrejection', ({ reason }) => showError(reason));
 addEventListener('error', ({ error }) => error && showError(error)); // browser notices have no error
-main().catch(showError);
+main().catch((error: unknown) => error instanceof NoGraphics || showError(error));

@@ -15,7 +15,7 @@ export interface Bundle {
   photograph(name: string): Promise<string>;
 }
 
-const MOST_BESIDE = 1 << 26; // bytes of any file but surfels and texels
+export const MOST_BESIDE = 1 << 26; // bytes of any file but surfels and texels
 
 export type Progress = (done: number, total: number) => void;
 

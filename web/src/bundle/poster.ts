@@ -1,5 +1,6 @@
-// Poster of a bundle: a picture of the first view, shown before the surfels arrive.
-import { readPart } from './load';
+// Pictures of a bundle's first view: the poster, shown before the surfels arrive, and the preview, shown where nothing
+// can draw.
+import { MOST_BESIDE, readPart } from './load';
 import type { Manifest } from './manifest';
 import type { Source } from './source';
 
@@ -31,4 +32,15 @@ export async function loadPoster(source: Source, info: Manifest): Promise<Blob |
   } catch {
     return null;
   }
+}
+
+// Loads the preview; null if missing or damaged.
+export async function loadPreview(source: Source, info: Manifest): Promise<Blob | null> {
+  const name = ['preview.jpg', 'preview.png'].find((each) => (info.files.get(each)?.bytes ?? Infinity) <= MOST_BESIDE);
+  if (!name) return null;
+  const type = name.endsWith('png') ? 'image/png' : 'image/jpeg';
+  return readPart(source, info, name, () => undefined).then(
+    (data) => new Blob([data], { type }),
+    () => null,
+  );
 }

@@ -1,5 +1,5 @@
 // WebGPU device.
-import { ViewerError, tooLarge } from '../errors';
+import { NoGraphics, ViewerError, tooLarge } from '../errors';
 
 const NEEDS =
   'Chrome and Edge from 113, Safari from 26 and Firefox from 141 have it. Update the browser and the graphics driver, ' +
@@ -14,9 +14,9 @@ export interface Graphics {
 
 export async function openDevice(): Promise<Graphics> {
   const gpu = (navigator as Partial<Navigator>).gpu;
-  if (!gpu) throw new ViewerError('This browser has no WebGPU', 'The viewer draws with WebGPU.', NEEDS);
+  if (!gpu) throw new NoGraphics('This browser has no WebGPU', 'The viewer draws with WebGPU.', NEEDS);
   const adapter = await gpu.requestAdapter({ powerPreference: 'high-performance' });
-  if (!adapter) throw new ViewerError('No graphics device', 'WebGPU finds nothing here that could draw.', NEEDS);
+  if (!adapter) throw new NoGraphics('No graphics device', 'WebGPU finds nothing here that could draw.', NEEDS);
   const wanted = ['texture-compression-bc', 'float32-blendable', 'float32-filterable'] as GPUFeatureName[];
   const features = wanted.filter((name) => adapter.features.has(name));
   const { maxTextureDimension2D, maxTextureArrayLayers, maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;

@@ -1,5 +1,5 @@
 // Pages in place of the scene: progress, poster, error.
-import { reasonOf } from '../errors';
+import { type ViewerError, reasonOf } from '../errors';
 import { element } from './dom';
 
 const megabytes = (bytes: number): string => (bytes / 1e6).toFixed(1);
@@ -10,7 +10,7 @@ export function showProgress(done: number, total: number): void {
   element('page-text').textContent = `${megabytes(done)} of ${megabytes(total)} MB`;
 }
 
-export const stopped = (): boolean => document.documentElement.dataset.state === 'error';
+export const stopped = (): boolean => ['error', 'picture'].includes(document.documentElement.dataset.state ?? '');
 
 let told: (title: string, message: string) => void = () => undefined;
 export const onError = (tell: typeof told): void => void (told = tell);
@@ -45,21 +45,40 @@ export function notify(text: string): void {
   setTimeout(() => (notice.hidden = true), 8000);
 }
 
+// Shows a picture in place of the canvas; returns false if it is none.
+async function showPicture(picture: Blob, unless = (): boolean => false): Promise<boolean> {
+  const image = element<HTMLImageElement>('poster');
+  const address = (image.src = URL.createObjectURL(picture));
+  const decoded = await image.decode().then(
+    () => true,
+    () => false,
+  );
+  URL.revokeObjectURL(address);
+  if (!decoded || unless()) return false;
+  image.hidden = false;
+  return true;
+}
+
+// Shows the first of these pictures that is one, with a line, instead of the error.
+export async function showInstead(error: ViewerError, pictures: (Blob | null)[], title: string): Promise<void> {
+  for (const picture of pictures) {
+    if (!picture || !(await showPicture(picture, stopped))) continue;
+    document.title = element<HTMLImageElement>('poster').alt = title;
+    element('page-title').textContent = error.title;
+    element('page-text').textContent = 'A picture of the scene is shown.';
+    element('page-progress').hidden = true;
+    document.documentElement.dataset.state = 'picture';
+    told(error.title, error.message);
+    return;
+  }
+  showError(error);
+}
+
 // The poster covers the canvas until the first frame.
 let posterEnded = false;
 
 export async function showPoster(poster: Blob | null): Promise<void> {
-  if (!poster || posterEnded) return;
-  const image = element<HTMLImageElement>('poster');
-  const address = (image.src = URL.createObjectURL(poster));
-  try {
-    await image.decode();
-  } catch {
-    posterEnded = true; // not a picture
-  }
-  URL.revokeObjectURL(address);
-  if (posterEnded) return;
-  image.hidden = false;
+  if (!poster || posterEnded || !(await showPicture(poster, () => posterEnded))) return;
   if (document.documentElement.dataset.state === 'loading') document.documentElement.dataset.state = 'poster';
 }
 

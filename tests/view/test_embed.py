@@ -73,6 +73,9 @@ def test_messages_of_the_page_around(bundle: Path, tmp_path: Path) -> None:
             drawn=False,
             viewport=(700, 200),
         )
+        hidden = ["init", "Object.defineProperty(Navigator.prototype, 'gpu', { value: undefined })"]
+        told = ["until", "of('error').some((m) => m.title === 'This browser has no WebGPU')"]
+        drive([hidden, ["goto", address], told], drawn=False)
     errors, ready, strangers = found.results[-7], found.results[-4], found.results[-1]
     assert errors == [9, 0, 1, 2, 3, 10, 11, 12, 13, 14, 20] and strangers == 0
     assert [each["title"] for each in ready] == [bundle.name, "second"]

@@ -57,7 +57,12 @@ async function notesOf(from: Source, stated: boolean): Promise<Notes> {
 async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promise<Bundle> {
   const from = await opened;
   const info = await loadManifest(from);
-  await Promise.race([opening, null]); // where nothing can draw, nothing more is fetched
+  opening.catch(async (error: unknown) => {
+    if (!(error instanceof NoGraphics)) return;
+    const pictures = [await loadPreview(from, info), await loadPoster(from, info)];
+    await showInstead(error, pictures, (await about()).title);
+  });
+  await Promise.race([opening, null]); // where nothing can draw, nothing of the scene is fetched
   if (!fromHash(location.hash)) void loadPoster(from, info).then(showPoster);
   return loadBundle(from, info, showProgress, async () => {
     const { deviceMemory } = navigator as { deviceMemory?: number }; // not in all browsers
@@ -65,22 +70,16 @@ async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promis
   });
 }
 
-// Shows a picture of the scene where nothing can draw it.
-async function drawNothing(error: NoGraphics, opened: Promise<Source>): Promise<void> {
-  const from = await opened;
-  const info = await loadManifest(from);
-  const pictures = [await loadPreview(from, info), await loadPoster(from, info)];
-  await showInstead(error, pictures, (await about()).title);
-}
+// Shows an error, except that of a page that shows a picture instead.
+const unlessPicture = (error: unknown): void => {
+  if (!(error instanceof NoGraphics)) showError(error);
+};
 
 async function main(): Promise<void> {
   const opening = openDevice();
   const opened = source();
-  opening.catch((error: unknown) => {
-    if (error instanceof NoGraphics) drawNothing(error, opened).catch(showError);
-  });
   const loading = load(opened, opening);
-  loading.catch(() => undefined); // handled where it is awaited
+  loading.catch(unlessPicture);
   const graphics = await opening;
   const { device } = graphics;
   watch(device, showError);
@@ -112,4 +111,4 @@ document.documentElement.dataset.state = 'loading';
 element('page-late').hidden = true;
 addEventListener('unhandledrejection', ({ reason }) => showError(reason));
 addEventListener('error', ({ error }) => error && showError(error)); // browser notices have no error
-main().catch((error: unknown) => error instanceof NoGraphics || showError(error));
+main().catch(unlessPicture);

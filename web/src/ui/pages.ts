@@ -64,9 +64,8 @@ export async function showInstead(error: ViewerError, pictures: (Blob | null)[],
   for (const picture of pictures) {
     if (!picture || !(await showPicture(picture, stopped))) continue;
     document.title = element<HTMLImageElement>('poster').alt = title;
-    element('page-title').textContent = error.title;
-    element('page-text').textContent = 'A picture of the scene is shown.';
-    element('page-progress').hidden = true;
+    element('page-title').textContent = 'No WebGPU here: this is a picture';
+    element('page-text').hidden = element('page-progress').hidden = true;
     document.documentElement.dataset.state = 'picture';
     told(error.title, error.message);
     return;

@@ -73,18 +73,6 @@ def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
     return abs(mask[0] / mask[1] / (photograph[0] / photograph[1]) - 1.0) <= PROPORTIONS
 
 
-def orientation(path: Path) -> int:
-    """Read the EXIF orientation, 1 to 8; 1 without one."""
-
-    def read(image: Image.Image) -> int:
-        if image.format == "PNG" and "exif" not in image.info:
-            return 1  # else PIL decodes the whole image in search of it
-        return image.getexif().get(ExifTags.Base.Orientation, 1)
-
-    value = from_header(path, read, 1)
-    return value if value in range(1, 9) else 1
-
-
 def exposure_stops(paths: Sequence[Path]) -> list[float]:
     """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown.
 
@@ -215,12 +203,9 @@ _WORDED = (FileNotFoundError, Image.DecompressionBombError)
 def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:
     """Explain that an image's `size` (width, height) is not the one `declared` by its camera."""
     shown = f"{size[0]} x {size[1]} pixels, but its camera is for {declared[0]} x {declared[1]}"
-    if size == declared[::-1] and orientation(path) >= 5:
-        return (
-            f"the image {path} is stored turned by a quarter: it has {shown}. Its EXIF tag asks viewers to turn it, "
-            "and the camera and pose are for the turned picture. Write the turn into the pixels with "
-            "`mogrify -auto-orient <photos>`, or swap w and h (and fl_x and fl_y, cx and cy) and turn the pose."
-        )
+    if size == declared[::-1]:
+        turn = "If an EXIF tag turns it for viewers, turn its pixels: `mogrify -auto-orient <photos>`"
+        return f"the image {path} is turned by a quarter: it has {shown}. {turn}. Else swap w and h, and cx and cy."
     return f"the image {path} has {shown}. Correct w, h, fl_x, fl_y, cx, cy in the capture, or resize the image."
 
 

@@ -4,7 +4,7 @@ import os
 import warnings
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,21 +25,11 @@ from bitymi_ns.progress import Progress, no_progress, rich_progress
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
-@dataclass(frozen=True)
-class KnownView:
-    """A photograph whose camera is known."""
-
-    file: Path
-    camera: ColmapCamera  # in pixels of the file
-    world_to_camera: np.ndarray  # [3,4] rotation and translation, OpenCV axes (x right, y down, z forward)
-    mask: Path | None = None  # black where no points are wanted; see `masks.mask_pixels`
-
-
 def triangulate(
-    capture: Path, views: Sequence[KnownView], progress: Progress | None = None, tell: Tell = warnings.warn
+    capture: Path, views: Sequence[Photograph], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs with known cameras, which are not refined. The model is cached, and an
-    interrupted run resumed, in the folder `capture` as by `find_poses`.
+    """Triangulate points from photographs with known cameras, in pixels of the files, which are not refined. The model
+    is cached, and an interrupted run resumed, in the folder `capture` as by `find_poses`.
 
     Returns:
         folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the poses, with image names
@@ -59,11 +49,12 @@ def triangulate(
     masks = [view.mask for view in views if view.mask is not None and os.path.isfile(view.mask)]
     inputs = list(zip(names, (view.file for view in views), strict=True))
     inputs += [(os.path.relpath(mask, capture), mask) for mask in masks]
-    key = content_key(inputs, [(view.camera, np.asarray(view.world_to_camera).tolist()) for view in views])
+    poses = [np.linalg.inv(view.pose @ OPENCV_AXES)[:3].tolist() for view in views]  # world to camera
+    key = content_key(inputs, [(view.camera, pose) for view, pose in zip(views, poses, strict=True)])
     folder = Path(os.path.commonpath([os.path.abspath(view.file.parent) for view in views]))
 
     def make(work: Path) -> None:
-        process.run(_job(names, views, work), capture, progress or no_progress)
+        process.run(_job(names, views, poses, work), capture, progress or no_progress)
         process.delete_work(work, "links", "masks")
         replace_stale(work, folder, content_key(inputs, "contents"))
 
@@ -79,11 +70,9 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     for photograph in photographs:
         camera = photograph.camera
         stored = (photograph.downscaled and image_size(photograph.file)) or camera.size
-        c2w = photograph.pose @ OPENCV_AXES
-        rotation = (mirror @ c2w[:3, :3]).T
-        translation = -rotation @ mirror @ (c2w[:3, 3] - middle)
-        pose = np.column_stack([rotation, translation])
-        views.append(KnownView(photograph.file, camera.rescaled(*stored), pose, photograph.mask))
+        pose = photograph.pose.copy()
+        pose[:3] = mirror @ (pose[:3] - np.pad(middle[:, None], ((0, 0), (3, 0))))
+        views.append(replace(photograph, camera=camera.rescaled(*stored), pose=pose))
     say(f"{source} has no points: they are triangulated from the photographs, once. --points random does without.")
     try:
         if any(mirrored) and not all(mirrored):
@@ -97,10 +86,10 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     return Points(model.xyz @ mirror + middle, model.rgb)
 
 
-def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
+def _job(stated: Sequence[str], views: Sequence[Photograph], poses: list[list[list[float]]], work: Path) -> Job:
     links, masks = emptied(work / "links"), emptied(work / "masks")
     groups: dict[ColmapCamera, list[str]] = defaultdict(list)
-    names, poses = {}, {}
+    names = {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
         suffix = view.file.suffix.lower()
         try:
@@ -115,9 +104,10 @@ def _job(stated: Sequence[str], views: Sequence[KnownView], work: Path) -> Job:
             converted.save(links / plain)
         groups[view.camera].append(plain)
         names[plain] = name
-        poses[plain] = np.asarray(view.world_to_camera, float)[:3].tolist()
         if view.mask is not None and os.path.isfile(view.mask):
             colmap_mask(view.mask, view.file.name, view.camera.size).save(masks / f"{plain}.png")
     mask_folder = str(masks.resolve()) if any(masks.iterdir()) else None
     cameras = [CameraGroup(camera, True, members) for camera, members in groups.items()]
-    return Job(str(work.resolve()), str(links.resolve()), mask_folder, cameras, list(names), names, poses=poses)
+    placed = dict(zip(names, poses, strict=True))
+    folders = str(work.resolve()), str(links.resolve()), mask_folder
+    return Job(*folders, cameras, list(names), names, poses=placed)

@@ -193,16 +193,8 @@ def check_point_unit(
     away = np.median(np.linalg.norm(points - middle, axis=1))
     spread = np.median(np.linalg.norm(points - cloud_middle, axis=1))
     picture = np.median(np.linalg.norm(centers - cloud_middle, axis=1) * widths)  # picture width at the cloud
-    hint = "Give the points in the unit of the poses, or remove the cloud to start from random points."
-    if apart > 0.0 and away > OTHER_UNIT * apart:
-        warn(
-            "The point cloud seems to be in another unit than the poses: half of its points are more than "
-            f"{_rounded(away / apart)} times as far from the cameras as these are from their middle. {hint}"
-        )
-    elif 0.0 < spread < picture / OTHER_UNIT:
-        what = f"half of its points lie in a spot that is 1/{_rounded(picture / spread)} of a picture's width. {hint}"
-        warn(f"The point cloud seems to be in another unit than the poses: {what}")
-
-
-def _rounded(ratio: float) -> str:
-    return f"{ratio:,.0f}" if ratio < 1e6 else f"{ratio:.0e}"
+    far, near = away > OTHER_UNIT * apart > 0.0, 0.0 < spread < picture / OTHER_UNIT
+    if far or near:
+        where = "far beyond the cameras" if far else "in a spot of the pictures"
+        hint = "Give the points in the unit of the poses, or remove the cloud to start from random points."
+        warn(f"The point cloud seems to be in another unit than the poses: half of its points lie {where}. {hint}")

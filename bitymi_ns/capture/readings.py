@@ -28,9 +28,9 @@ Features = tuple[Array, npt.NDArray[np.float32]]
 """Positions [n, 2] in pixels of the camera, and descriptors [n, 128] of length 1."""
 AUTO, WRITTEN = "auto", "written"
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
-CAMERA_AXES = {"opengl": np.eye(4), "opencv": OPENCV_AXES, "lefthanded": MIRROR}
+CAMERA_AXES = {"opengl": np.eye(4), "opencv": OPENCV_AXES, "left-handed": MIRROR}
 TURNS = {"": 0, "turn90": 90, "turn180": 180, "turn270": 270}  # degrees about the optical axis
-SWAPPED, NO_DISTORTION = "swapped", "undistorted"
+SWAPPED, NO_DISTORTION = "sides-swapped", "no-distortion"
 INTRINSICS = {f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)}
 """Factors on focal lengths and principal points, as of pictures of another size."""
 ENOUGH = 100  # matches that decide
@@ -86,7 +86,7 @@ def read_as(poses: Array, own: Reading, reading: Reading) -> tuple[Array, Array]
         matrices[:, :3, :3] = Rotation.from_quat(np.stack(meant, 1)).as_matrix()
     matrices = np.linalg.inv(matrices) if reading.direction == "w2c" else matrices
     matrices = matrices @ CAMERA_AXES[reading.axes]
-    mirrored = reading.axes == "lefthanded" and np.median(np.linalg.det(matrices)) < 0.0
+    mirrored = reading.axes == "left-handed" and np.median(np.linalg.det(matrices)) < 0.0
     world, turn = MIRROR if mirrored else np.eye(4), np.eye(4)
     turn[:3, :3] = Rotation.from_euler("z", TURNS[reading.turn], degrees=True).as_matrix().round()
     return world @ matrices @ turn, world

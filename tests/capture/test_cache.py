@@ -11,11 +11,11 @@ from PIL import Image
 
 from bitymi_ns import files
 from bitymi_ns.capture.cache import keep_work_folder
-from bitymi_ns.capture.known_poses import KnownView, triangulate
+from bitymi_ns.capture.known_poses import triangulate
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import Job
-from bitymi_ns.capture.types import CaptureError, ColmapCamera, SfmOptions
+from bitymi_ns.capture.types import CaptureError, ColmapCamera, Photograph, SfmOptions
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def triangulated(photographs: Path, monkeypatch: pytest.MonkeyPatch) -> Callable
     def find(**masks: Path) -> Path:
         camera = ColmapCamera("PINHOLE", 64, 48, (64.0, 64.0, 32.0, 24.0))
         files = sorted(photographs.glob("*.png"))
-        views = [KnownView(file, camera, np.eye(4)[:3], **masks) for file in files]
+        views = [Photograph(file, camera, np.eye(4), "", **masks) for file in files]
         before = len(runs)
         model = triangulate(photographs, views)
         find.anew = len(runs) > before  # type: ignore[attr-defined]

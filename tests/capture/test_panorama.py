@@ -9,10 +9,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.known_poses import KnownView, triangulate
+from bitymi_ns.capture.known_poses import triangulate
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.sfm_photos import has_panorama_metadata, looks_panoramic
-from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, SfmOptions
+from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, Photograph, SfmOptions
 from bitymi_ns.sample.room import Room
 
 XMP = (
@@ -127,8 +127,10 @@ def test_points_are_triangulated_from_panoramas_with_poses(tmp_path: Path, monke
     for i in range(4):
         centre = np.array([-1.0 + 0.4 * i, -1.3 + 0.1 * i * i, 1.3])
         Image.fromarray(panorama(0.0, 512, tuple(centre.tolist()))[:, ::-1]).save(tmp_path / f"{i}.png")
-        pose = np.column_stack([axes, -axes @ centre])
-        views.append(KnownView(tmp_path / f"{i}.png", ColmapCamera(SPHERICAL_MODEL, 1024, 512, (1024.0, 512.0)), pose))
+        pose = np.eye(4)
+        pose[:3] = np.column_stack([axes.T * (1, -1, -1), centre])
+        camera = ColmapCamera(SPHERICAL_MODEL, 1024, 512, (1024.0, 512.0))
+        views.append(Photograph(tmp_path / f"{i}.png", camera, pose, ""))
     model = pycolmap.Reconstruction(triangulate(tmp_path, views))
     xyz = np.array([point.xyz for point in model.points3D.values()])
     inside = ((xyz > np.array([-3.05, -2.55, -0.05])) & (xyz < np.array([3.05, 2.55, 2.65]))).all(1)

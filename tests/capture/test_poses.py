@@ -13,10 +13,10 @@ import pytest
 from PIL import ExifTags, Image
 
 from bitymi_ns.capture.exif import Exif
-from bitymi_ns.capture.known_poses import KnownView, triangulate
+from bitymi_ns.capture.known_poses import triangulate
 from bitymi_ns.capture.poses import _finished, _photographs_in, by_camera, camera_group, find_poses, make_job, ordered
 from bitymi_ns.capture.sfm_photos import Photo
-from bitymi_ns.capture.types import CaptureError, ColmapCamera, SfmOptions, SfmSettings
+from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, SfmOptions, SfmSettings
 from bitymi_ns.cli import main
 from bitymi_ns.sample.capture import RoomView, render
 from bitymi_ns.sample.room import Room
@@ -120,7 +120,7 @@ def test_names_that_are_not_utf8_are_refused_before_the_work(copied: Copy, tmp_p
         find_poses(folder, progress=never)
     with pytest.raises(CaptureError, match="is not UTF-8: rename it"):
         camera = ColmapCamera("PINHOLE", 9, 9, (9, 9, 5, 5))
-        known = [KnownView(folder / f"photo_{i}.png", camera, np.eye(4)[:3]) for i in (1, 2)]
+        known = [Photograph(folder / f"photo_{i}.png", camera, np.eye(4), "") for i in (1, 2)]
         triangulate(folder, known, never)
 
 
@@ -189,11 +189,8 @@ def test_points_are_triangulated_for_known_poses(arc: Path, views: list[RoomView
     folder = copied("known")
     known = []
     for i, view in enumerate(views):
-        pose = np.vstack([view.camera_to_world[:3], [0, 0, 0, 1]]).astype(float)
-        pose[:3, 1:3] *= -1
-        inverse = np.linalg.inv(pose)[:3]
         camera = ColmapCamera("PINHOLE", 288, 216, (view.focal, view.focal, 144.0, 108.0))
-        known.append(KnownView(folder / f"photo_{i + 1}.png", camera, inverse))
+        known.append(Photograph(folder / f"photo_{i + 1}.png", camera, view.camera_to_world, ""))
     model = pycolmap.Reconstruction(triangulate(folder, known))
     points = np.array([point.xyz for point in model.points3D.values()])
     assert len(points) > 50
@@ -201,7 +198,7 @@ def test_points_are_triangulated_for_known_poses(arc: Path, views: list[RoomView
     assert inside.all(axis=1).mean() > 0.8  # the rest is the landscape outside the window
     for view in known:
         found = model.find_image_with_name(view.file.name).cam_from_world().matrix()
-        np.testing.assert_allclose(found, view.world_to_camera, atol=1e-9)
+        np.testing.assert_allclose(found, np.linalg.inv(view.pose @ OPENCV_AXES)[:3], atol=1e-9)
 
 
 def noise(rng: np.random.Generator, size: tuple[int, int] = (50, 40)) -> Image.Image:

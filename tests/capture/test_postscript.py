@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from PIL import EpsImagePlugin, Image
 
-from bitymi_ns.capture.image_files import file_has_transparency, orientation, read_image, set_up_pillow
+from bitymi_ns.capture.image_files import file_has_transparency, read_image, set_up_pillow
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.prepare import colmap_mask
 from bitymi_ns.capture.sfm_photos import read_photo
@@ -47,7 +47,7 @@ def test_it_is_not_run(reader: str, disguised: Path, ran: Path) -> None:
     with pytest.raises((CaptureError, CaptureError, OSError), match="cannot"):
         READERS[reader](disguised)
     assert not ran.exists()
-    assert orientation(disguised) == 1 and not file_has_transparency(disguised)
+    assert not file_has_transparency(disguised)
 
 
 def test_nor_by_the_readers_of_nerfstudio(disguised: Path, ran: Path) -> None:

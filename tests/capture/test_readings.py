@@ -71,7 +71,7 @@ def test_matches_need_no_poses(photographs: list[Photograph], pairs: list[readin
 def misread(right: np.ndarray, own: Reading, meant: Reading) -> np.ndarray:
     """Write poses in the convention of a reading, and read the file in the format's own."""
     poses = right @ np.linalg.matrix_power(QUARTER, -TURNS[meant.turn] // 90)
-    poses = MIRROR @ poses @ MIRROR if meant.axes == "lefthanded" else poses @ CAMERA_AXES[meant.axes]
+    poses = MIRROR @ poses @ MIRROR if meant.axes == "left-handed" else poses @ CAMERA_AXES[meant.axes]
     poses = np.linalg.inv(poses) if meant.direction == "w2c" else poses
     if own.order:
         columns = {"xyzw": [0, 1, 2, 3], "wxyz": [3, 0, 1, 2]}
@@ -90,14 +90,14 @@ def test_every_misreading_is_found(convention: Reading, photographs: list[Photog
             wrong = misread(right, convention, reading)
             assert decide(photographs, wrong, convention).reading == reading
             meant, mirror = read_as(wrong, convention, reading)
-            assert (np.linalg.det(mirror) < 0.0) == (reading.axes == "lefthanded")
+            assert (np.linalg.det(mirror) < 0.0) == (reading.axes == "left-handed")
             np.testing.assert_allclose(meant, right, atol=1e-9)
 
 
 def test_a_mirrored_camera_leaves_the_world(photographs: list[Photograph]) -> None:
     """Camera axes alone may be left-handed: the determinant is negative."""
     right = poses_of(photographs)
-    meant, mirror = read_as(right @ MIRROR, JSON, Reading("lefthanded"))
+    meant, mirror = read_as(right @ MIRROR, JSON, Reading("left-handed"))
     assert (mirror == np.eye(4)).all()
     np.testing.assert_allclose(meant, right, atol=1e-12)
 
@@ -122,7 +122,7 @@ def test_none_fits(photographs: list[Photograph], reported: list[str]) -> None:
     lens = ColmapCamera("OPENCV", *SIZE, (*photographs[0].camera.params, 3.0, 9.0, 0.0, 0.0))
     given = [replace(each, camera=lens) for each in photographs]
     meant, _, name = as_meant(given, JSON, np.eye(4), "transforms.json", "auto")
-    assert name == "opengl-c2w-undistorted" and meant[0].camera == photographs[0].camera
+    assert name == "opengl-c2w-no-distortion" and meant[0].camera == photographs[0].camera
 
 
 def test_what_is_asked_for(photographs: list[Photograph], reported: list[str]) -> None:

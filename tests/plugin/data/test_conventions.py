@@ -9,9 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 import yaml
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns import load_capture
 from bitymi_ns.capture import readings
 from bitymi_ns.capture.points import read_points
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
@@ -97,7 +99,7 @@ def test_right_ones_are_nothing_to_speak_of(
         (lambda c: of_json(c, lambda pose: pose @ FLIP), "opencv-c2w"),
         (lambda c: of_json(c, np.linalg.inv), "opengl-w2c"),
         (lambda c: of_json(c, lambda pose: np.linalg.inv(pose @ FLIP)), "opencv-w2c"),
-        (lambda c: of_json(c, lambda pose: pose @ MIRROR), "lefthanded-c2w"),
+        (lambda c: of_json(c, lambda pose: pose @ MIRROR), "left-handed-c2w"),
         (lambda c: of_json(c, lambda pose: pose @ QUARTER), "opengl-c2w-turn270"),
         (lambda c: of_model(c, lambda w2c: FLIP @ w2c), "opengl-w2c-wxyz"),
         (lambda c: of_model(c, np.linalg.inv), "opencv-c2w-wxyz"),
@@ -108,8 +110,7 @@ def test_right_ones_are_nothing_to_speak_of(
 def test_others_are_read_as_meant(
     capture: Path, write: Callable[[Path], Path], name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    right = load_any(capture).train_dataset.cameras.camera_to_worlds
-    readings._decided.clear()
+    right = load_any(capture, poses_as="written").train_dataset.cameras.camera_to_worlds
     data = write(capture)
     manager = load_any(data)
     text = printed(capsys)
@@ -130,14 +131,13 @@ def relative(poses: Any) -> Any:
 
 
 def test_a_left_handed_world_is_mirrored_with_its_cloud(capture: Path) -> None:
-    right = load_any(capture).train_dataparser_outputs
-    readings._decided.clear()
+    right = load_any(capture, poses_as="written").train_dataparser_outputs
     of_json(capture, lambda pose: MIRROR @ pose @ MIRROR)
     cloud = capture / "sparse_pc.ply"
     points = read_points(cloud)[0]
     write_cloud(cloud, points.xyz * (1, 1, -1), points.rgb)
     found = load_any(capture).train_dataparser_outputs
-    assert decided() == "lefthanded-c2w"
+    assert decided() == "left-handed-c2w"
     np.testing.assert_allclose(found.metadata["points3D_xyz"], right.metadata["points3D_xyz"], atol=1e-5)
     np.testing.assert_allclose(found.cameras.camera_to_worlds, right.cameras.camera_to_worlds, atol=1e-5)
 
@@ -146,8 +146,10 @@ def test_cameras_at_one_place_as_written(capture: Path) -> None:
     """Poses of a turntable, read in the wrong direction, put all cameras at one place: no reason to stop."""
     edit(capture, lambda meta: meta.pop("ply_file_path"))
     of_json(capture, lambda pose: np.linalg.inv(pose))
-    load_any(capture)
+    views = load_capture(capture, points="random")[0]
     assert decided() == "opengl-w2c"
+    as_written = load_capture(capture, points="random", poses_as="written")[0]
+    assert not torch.allclose(views[0].camera.viewmat, as_written[0].camera.viewmat)
 
 
 def test_a_run_records_its_reading(capture: Path, tmp_path: Path) -> None:

@@ -195,7 +195,7 @@ def with_orientation(path: Path, image: Image.Image, value: int) -> None:
 def test_turned_photographs(capture: Path) -> None:
     paths = images_of(capture)
     with_orientation(paths[3], Image.open(paths[3]).rotate(90, expand=True), 6)
-    with expect(f"{paths[3].name} is stored turned by a quarter: it has 36 x 48 .* camera is for 48 x 36.*EXIF tag"):
+    with expect(f"{paths[3].name} is turned by a quarter: it has 36 x 48 .* camera is for 48 x 36.*EXIF tag"):
         _ = load(capture).cached_train
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 
 from bitymi_ns.capture import known_poses
 from bitymi_ns.capture.points import read_points
+from bitymi_ns.capture.types import Photograph
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.sample.capture import camera_path, render
@@ -88,11 +89,11 @@ def test_what_cannot_be_triangulated(
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[known_poses.KnownView]]:
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[Photograph]]:
     """Record the arguments of a stubbed triangulation, which returns two points."""
-    calls: list[list[known_poses.KnownView]] = []
+    calls: list[list[Photograph]] = []
 
-    def triangulate(home: Path, views: list[known_poses.KnownView], *told: Any) -> Path:
+    def triangulate(home: Path, views: list[Photograph], *told: Any) -> Path:
         calls.append(views)
         model = home / "triangulated"
         model.mkdir(exist_ok=True)

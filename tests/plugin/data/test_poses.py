@@ -164,7 +164,7 @@ def test_groups_of_cameras_are_neither_a_mistake_nor_another_unit(capsys: pytest
 
 @pytest.mark.parametrize(
     ("factor", "message"),
-    [(1.0, ""), (1000.0, "times as far from the cameras as these"), (0.001, "of a picture's width")],
+    [(1.0, ""), (1000.0, "far beyond the cameras"), (0.001, "in a spot of the pictures")],
 )
 def test_a_cloud_in_another_unit(
     capture: Path, capsys: pytest.CaptureFixture[str], factor: float, message: str

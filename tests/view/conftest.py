@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -67,11 +68,14 @@ def write(
     larger: float = 0.0,
     alpha: bool = False,
     near: float | None = None,
+    unit: float = 1.0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     **options: object,
 ) -> Path:
-    """Write a bundle of `baked_scene` with a camera and its photograph, and optionally a poster."""
+    """Write a bundle of `baked_scene` with a camera and its photograph, and optionally a poster; `unit`: factor of all
+    lengths."""
     camera = view()
+    camera.viewmat[:3, 3] *= unit
     picture = io.BytesIO()
     Image.new("RGB", (WIDTH, HEIGHT), (200, 80, 40)).save(picture, "JPEG")
     K = camera.K.tolist()
@@ -81,7 +85,7 @@ def write(
         **{"viewmat": camera.viewmat.flatten().tolist(), "photograph": "photograph-0001.jpg"},
     }
     moved = camera.viewmat.clone()
-    moved[0, 3] = 0.5
+    moved[0, 3] = 0.5 * unit
     other = {**row, "name": "second.jpg", "held_out": False, "viewmat": moved.flatten().tolist()}
     del other["photograph"]
     extra = {
@@ -91,6 +95,10 @@ def write(
     baked = baked_scene(format, count, compact, seen, kind, larger, alpha, tuple(options.items()))
     if near is not None:
         baked = replace(baked, scene=replace(baked.scene, near=near))
+    if unit != 1.0:
+        surfels = {**baked.scene.surfels, "means": baked.scene.surfels["means"] * unit}
+        surfels["log_scales"] = surfels["log_scales"] + math.log(unit)
+        baked = replace(baked, scene=replace(baked.scene, surfels=surfels, near=baked.scene.near * unit))
     export(baked, folder, background=background, extra_files=extra, first=camera if poster else None)
     return folder
 

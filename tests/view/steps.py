@@ -89,10 +89,12 @@ class Steps:
         """Run all steps on a page of the bundle; fails on console errors. `drawn`: see `drive`."""
         with served(site_of(bundle)) as address:
             before = [["goto", address + start], ["settle"]]
+            if script := options.pop("script", ""):
+                before.insert(0, ["init", script])
             if options.pop("quarter", True):
                 before.insert(0, ["init", QUARTER])
             self.outcome = drive([*before, *self.steps], drawn=drawn, **{"viewport": SCREEN, **options})
-        assert not self.outcome.problems
+        assert not self.outcome.problems, self.outcome.problems
         self.outcome.results = self.outcome.results[len(before) :]
 
     def __getitem__(self, number: int) -> Any:

@@ -125,6 +125,27 @@ def test_panels_and_help_fit_the_screen(cropped: tuple[Path, str, str], phone: b
     assert all(page[number] for number in fits) and page[closed] is False
 
 
+HALF = (
+    "const has = globalThis.GPUSupportedFeatures?.prototype.has; if (has) GPUSupportedFeatures.prototype.has = "
+    "function (name) { return !name.startsWith('float32-') && has.call(this, name); }"
+)
+"""A device that blends in half floats alone."""
+
+
+def test_a_device_that_blends_half_floats_measures_scenes_of_any_size(tmp_path: Path) -> None:
+    lengths = []
+    for unit, script in ((1.0, ""), (1.0, HALF), (1e5, HALF), (1e-5, HALF)):
+        page = Steps()
+        page.do(["press", "#measure"], ["press", "#add-measure"], click(FIRST))
+        page.do(["until", "document.querySelector('.ends').getAttribute('d')"], click(SECOND))
+        page.do(["until", f"{LABELS}.includes('units')"])
+        label, hint = page.ask(LABELS), page.ask("document.getElementById('measure-hint').textContent")
+        page.run(write(tmp_path / f"{unit} {len(script)}", larger=1.5, unit=unit), drawn=True, script=script)
+        lengths.append(float(page[label].split()[0]) / unit)
+        assert ("three digits" in page[hint]) is bool(script)
+    assert np.allclose(lengths, lengths[0], rtol=2e-3)
+
+
 def test_a_resting_finger_measures(solid: Path) -> None:
     page, dots = Steps(), "document.querySelector('.ends').getAttribute('d').split('M').length - 1"
     hint = "document.getElementById('measure-hint').textContent"

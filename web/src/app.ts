@@ -147,6 +147,10 @@ export class App implements Stage {
     this.fly({ pose: moved({ ...pose, position: target }, 0, 0, -away), lens: this.lens, target });
   }
 
+  get coarse(): boolean {
+    return this.renderer.coarse;
+  }
+
   depths(view: View): Promise<Depths> {
     return this.renderer.depths(view, this.options(view.width === 1));
   }

@@ -141,7 +141,7 @@ fn surfel(c: Corner) -> @location(0) vec4f {
   let textured = colored && f.sigma * front >= frame.weight_bound;
   if textured && !cut { texel = texels(c, f.at); }
   switch frame.show {
-    case SHOW_DEPTH: { return vec4f(f.sigma * f.depth, f.sigma * c.w0_z_opacity_beta.w, f.sigma, f.sigma); }
+    case SHOW_DEPTH: { return vec4f(f.sigma * (f.depth / frame.depth_unit), f.sigma * c.w0_z_opacity_beta.w, f.sigma, f.sigma); }
     case SHOW_NORMAL: {
       return vec4f(f.sigma * vec3f(-c.v_w.zw * frame.lens.xy, c.texel.z), f.sigma);
     }

@@ -61,7 +61,7 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   s.axis = r.axis;
   s.middle = r.middle;
   s.half_size = r.half_size;
-  let direction = unit(surfel.mean - frame.color_center.xyz);
+  let direction = unit(surfel.mean - frame.color_center);
   s.level = tile_level(s, surfel);
   s.color = max(view_color(frame.kind, surfel, direction) + COLOR_BIAS, vec3f(0.0));
   seen[i] = s;

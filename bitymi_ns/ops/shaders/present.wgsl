@@ -52,8 +52,8 @@ fn present(@builtin(position) position: vec4f) -> @location(0) vec4f {
   let covered = 1.0 - s.a;
   switch screen.show {
     case SHOW_DEPTH: {
-      let depth = s.r / max(covered, 1e-4);
-      return vec4f(mix(screen.background.rgb, ramp(1.0 - depth / screen.most), covered), 1.0);
+      let depth = s.r / max(covered, 1e-4); // 1: the farthest
+      return vec4f(mix(screen.background.rgb, ramp(1.0 - depth), covered), 1.0);
     }
     case SHOW_NORMAL: {
       let normal = s.rgb / max(covered, 1e-4);

@@ -54,7 +54,8 @@ struct Frame {
   rotation: array<vec4f, 3>,  // rows, world to camera
   center: vec3f,  // camera centre relative to the scene's origin
   alpha_scale: f32,  // m = alpha_scale * a texel's alpha multiplies sigma; 0: opaque scene
-  color_center: vec4f,  // viewpoint for view colours; `center` unless frozen
+  color_center: vec3f,  // viewpoint for view colours; `center` unless frozen
+  depth_unit: f32,  // of blended depths, which half floats must hold
   lens: vec4f,  // fx, fy, cx, cy
   size: vec2f,  // pixels
   near: f32,

@@ -241,7 +241,7 @@ class SceneOnDevice:
         data = struct.pack(
             "<32f6IfI",
             *(value for row in rows for value in row),
-            *(*center, self._alpha_scale, *center, 0.0),
+            *(*center, self._alpha_scale, *center, 1.0),
             *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
             *(camera.width, camera.height, self._near, self._bound),
             *(self._offset, self._scale, *self._atlas_size),

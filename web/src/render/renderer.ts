@@ -62,6 +62,11 @@ export class Renderer {
     this.smooth = device.createSampler({ magFilter: 'linear', minFilter: 'linear' });
   }
 
+  // Whether depths of single pixels are blended in half floats.
+  get coarse(): boolean {
+    return !this.graphics.floats;
+  }
+
   // Largest side of a picture, pixels.
   get largestSide(): number {
     return this.graphics.device.limits.maxTextureDimension2D;
@@ -110,7 +115,7 @@ export class Renderer {
     [right, down, forward].forEach((row, k) => f.set(row, 4 * k));
     const relative = (at: Vec3): number[] => at.map((x, c) => x - surfels.origin[c]);
     f.set([...relative(view.pose.position), alphaScale], 12);
-    f.set(relative(options.held ?? view.pose.position), 16);
+    f.set([...relative(options.held ?? view.pose.position), options.farthest], 16);
     f.set([view.fx, view.fy, view.cx, view.cy], 20);
     f.set([width, height, info.near, info.weightBound], 24);
     f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], 28);
@@ -159,7 +164,7 @@ export class Renderer {
     const [f, u] = [new Float32Array(data), new Uint32Array(data)];
     f.set([...options.background, 1, to.width, to.height]);
     u[6] = SHOW[options.show];
-    f.set([options.show === 'overdraw' ? MOST_OVERDRAW : options.farthest, width, height], 7);
+    f.set([MOST_OVERDRAW, width, height], 7);
     u.set([part[0], part[1], target.samples], 10);
     f.set(options.correction ?? UNCHANGED, 16);
     device.queue.writeBuffer(this.screen, 0, data);
@@ -197,7 +202,8 @@ export class Renderer {
       const channel = (c: number): number =>
         bytes === 16 ? pixel.getFloat32(4 * c, true) : half(pixel.getUint16(2 * c, true));
       const covered = 1 - channel(3); // draw.wgsl
-      depth[i] = covered < 0.5 ? Infinity : channel(0) / covered;
+      const found = (channel(0) / covered) * options.farthest;
+      depth[i] = covered >= 0.5 && found < Infinity ? found : Infinity; // also NaN
     }
     return { width, height, depth };
   }
@@ -235,5 +241,6 @@ export class Renderer {
 // Converts a non-negative half-precision number.
 const half = (bits: number): number => {
   const exponent = bits >> 10;
+  if (exponent > 30) return bits & 1023 ? NaN : Infinity;
   return exponent ? 2 ** (exponent - 25) * (1024 + (bits & 1023)) : 2 ** -24 * bits;
 };

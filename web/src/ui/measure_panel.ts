@@ -12,6 +12,7 @@ import type { Stage } from './stage';
 
 const UNKNOWN: Unit = { name: 'units', perWorld: 1 };
 const DIGITS = 4;
+const COARSE = 'This device measures depths to three digits.'; // of half floats
 
 export const distance = ({ points: [a, b] }: Measure): number => length(subtract(a, b));
 
@@ -52,7 +53,8 @@ export class MeasurePanel {
     const dots = measures.flatMap(({ points }): Vec3[] => points);
     const waits = pressed(element('add-measure'));
     if (this.first && waits) dots.push(this.first);
-    element('measure-hint').textContent = waits ? `Click the ${this.first ? 'other' : 'first'} surface.` : '';
+    const click = waits ? [`Click the ${this.first ? 'other' : 'first'} surface.`] : [];
+    element('measure-hint').textContent = [...click, ...(this.stage.coarse ? [COARSE] : [])].join(' ');
     this.lines.draw(
       view,
       measures.map(({ points }): Line => points),

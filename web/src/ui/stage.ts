@@ -4,6 +4,7 @@ import type { View } from '../view/pose';
 import type { Shared, Viewpoint } from '../view/share';
 
 export interface Stage {
+  readonly coarse: boolean; // see Renderer
   shared(): Shared;
   // The target is by default ahead, at the distance of the cameras' common target, or else at the size of the scene.
   go(to: Omit<Viewpoint, 'target'> & Partial<Viewpoint>): void;

@@ -1,6 +1,8 @@
 """Decide by the photographs how poses and intrinsics of a capture are to be read: match pairs of photographs without
 their poses, and count the matches that each reading explains."""
 
+import os
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -119,8 +121,7 @@ def match_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
     """Match pairs of photographs that are near by name or look alike, and move; their poses are not used."""
     order = sorted(range(len(photographs)), key=lambda i: natural(str(photographs[i].file)))
     if len(order) > CLIPS * CLIP:
-        order = [order[i + k] for i in spread(len(order) - CLIP + 1, CLIPS) for k in range(CLIP)]
-    order = list(dict.fromkeys(order))
+        order = list(dict.fromkeys(order[i + k] for i in spread(len(order) - CLIP + 1, CLIPS) for k in range(CLIP)))
     features = in_threads(lambda i: _features(photographs[i]), order)
     near, wide = [], []
     for i, j in combinations(range(len(order)), 2):
@@ -128,12 +129,9 @@ def match_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
             near.append((i, j))
         elif len(_mutual(features[i][1][:COARSE], features[j][1][:COARSE])) >= ALIKE:
             wide.append((i, j))
-    rng, pairs = np.random.default_rng(0), []
-    tried = [
-        (k * every, *some[i])
-        for every, some in ((1, near), (2, wide))
-        for k, i in enumerate(rng.permutation(len(some)))
-    ]
+    rng, pairs, tried = np.random.default_rng(0), [], []
+    for step, some in ((1, near), (2, wide)):
+        tried += [(k * step, *some[i]) for k, i in enumerate(rng.permutation(len(some)))]
     for _, i, j in sorted(tried)[:TRIALS]:
         if len(pairs) < PAIRS:
             pairs += _match([each.camera for each in photographs], order[i], order[j], features[i], features[j])
@@ -280,9 +278,10 @@ def as_meant(
         fail(f"--poses-as is {asked}, but {source} can be read as {AUTO}, {WRITTEN}, or as {', '.join(some[1:])}.")
     reading, explains = decision.reading, "of what pairs of photographs have in common"
     if reading is None:
+        folder = shlex.quote(os.path.commonpath([os.path.abspath(each.file.parent) for each in photographs]))
         warn(
             f"{source}: the poses fit the photographs badly: they explain {decision.written:.0%} {explains}, where "
-            f"{decision.own:.0%} can be; least in {listed(decision.worst)}. `bitymi sfm` finds poses from photographs."
+            f"{decision.own:.0%} can be; least in {listed(decision.worst)}. `bitymi sfm {folder}` finds others."
         )
     if reading is None or reading == written:
         return list(photographs), np.eye(4), WRITTEN

@@ -64,10 +64,11 @@ async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promis
   });
   await Promise.race([opening, null]); // where nothing can draw, nothing of the scene is fetched
   if (!fromHash(location.hash)) void loadPoster(from, info).then(showPoster);
-  return loadBundle(from, info, showProgress, async () => {
+  const admit = async (): Promise<void> => {
     const { deviceMemory } = navigator as { deviceMemory?: number }; // not in all browsers
     checkRoom(info, (await opening).device.limits, deviceMemory);
-  });
+  };
+  return loadBundle(from, info, showProgress, admit, notify);
 }
 
 // Shows an error, except that of a page that shows a picture instead.

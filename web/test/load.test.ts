@@ -15,6 +15,8 @@ const listed = (text: string, size = text.length): { bytes: number; sha256: stri
   sha256: createHash('sha256').update(text).digest('hex'),
 });
 
+const said: string[] = [];
+
 class Sent implements Source {
   constructor(private readonly files: Record<string, Uint8Array>) {}
   read(name: string): Promise<ArrayBuffer> {
@@ -30,7 +32,13 @@ class Sent implements Source {
 
 // Without surfels, which have no decoder here; the files after them are requested at the same time.
 const open = (files: Record<string, Uint8Array>, about: Manifest, admit = (): Promise<void> => Promise.resolve()) =>
-  loadBundle(new Sent({ 'surfels.bin': new Uint8Array(), ...files }), about, () => undefined, admit);
+  loadBundle(
+    new Sent({ 'surfels.bin': new Uint8Array(), ...files }),
+    about,
+    () => undefined,
+    admit,
+    (line) => said.push(line),
+  );
 const withFile = (name: string, entry: { bytes: number; sha256: string }): Manifest => ({
   ...info,
   files: new Map([['surfels.bin', listed('')], ...(name ? [[name, entry] as const] : [])]),
@@ -53,6 +61,67 @@ describe('a scene', () => {
   it('that is not admitted is not decoded', async () => {
     const no = new ViewerError('too large', '', '');
     await expect(open({}, withFile('', listed('')), () => Promise.reject(no))).rejects.toBe(no);
+  });
+});
+
+class Slow {
+  static made: Slow[] = [];
+  ended = false;
+  onmessage: (event: unknown) => void = () => undefined;
+  onerror: (event: unknown) => void = () => undefined;
+  constructor() {
+    Slow.made.push(this);
+  }
+  postMessage(): void {
+    return undefined;
+  }
+  terminate(): void {
+    this.ended = true;
+  }
+}
+
+describe('a decoder', () => {
+  afterEach(() => {
+    vi.useRealTimers();
+    vi.unstubAllGlobals();
+    Slow.made = [];
+    said.length = 0;
+  });
+  const worker = async (): Promise<Slow> => vi.waitUntil(() => Slow.made.at(-1));
+
+  it('that takes minutes is waited for, says so, and is ended', async () => {
+    vi.stubGlobal('Worker', Slow);
+    vi.useFakeTimers({ toFake: ['setTimeout', 'clearTimeout'] });
+    const loading = open({}, withFile('', listed('')));
+    const slow = await worker();
+    vi.advanceTimersByTime(19_000);
+    expect(said).toEqual([]);
+    vi.advanceTimersByTime(200_000);
+    expect(said).toEqual(['surfels.bin is still being decoded.']);
+    expect(slow.ended).toBe(false);
+    slow.onmessage({ data: { made: {} } });
+    await loading;
+    expect(slow.ended).toBe(true);
+  });
+  it('that fails is ended', async () => {
+    vi.stubGlobal('Worker', Slow);
+    for (const fail of [
+      (slow: Slow): void => slow.onerror({ message: 'no script' }),
+      (slow: Slow): void => slow.onmessage({ data: { made: null, title: 'damaged', detail: '', advice: '' } }),
+    ]) {
+      Slow.made = [];
+      const loading = open({}, withFile('', listed('')));
+      fail(await worker());
+      await expect(loading).rejects.toThrow();
+      expect(Slow.made.every((each) => each.ended)).toBe(true);
+    }
+  });
+  it('of surfels is ended where the texels do not arrive', async () => {
+    vi.stubGlobal('Worker', Slow);
+    const loading = open({}, { ...withFile('', listed('')), atlas: {} as Manifest['atlas'] });
+    (await worker()).onmessage({ data: { made: {} } });
+    await expect((await loading).later!()).rejects.toThrowError(/does not list texels.bin/);
+    expect(Slow.made.map((each) => each.ended)).toEqual([true]);
   });
 });
 

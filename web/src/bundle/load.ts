@@ -36,12 +36,13 @@ export async function readPart(source: Source, info: Manifest, name: string, cam
   return data;
 }
 
-// Loads a bundle; `admit` rejects scenes that are too large, before anything is decoded.
+// Loads a bundle; `admit` rejects scenes that are too large, before anything is decoded; `say` shows a line.
 export async function loadBundle(
   source: Source,
   info: Manifest,
   progress: Progress,
   admit: (info: Manifest) => Promise<void>,
+  say: (line: string) => void,
 ): Promise<Bundle> {
   const first = info.compact ? ['surfels.bin'] : ['surfels.ply', ...(info.atlas ? ['atlas.ktx2'] : [])];
   const total = first.reduce((sum, name) => sum + (info.files.get(name)?.bytes ?? 0), 0);
@@ -68,10 +69,8 @@ export async function loadBundle(
     const pages = info.atlas ? await parseKtx2(atlas, info.atlas) : null;
     return { info, surfels: readSurfels(table, info), pages, later: null, cameras, photograph };
   }
-  const { Decoder } = await import('./compact/decoder');
-  const decoder = new Decoder();
-  const surfels = await decoder.surfels(table, info);
-  if (!info.atlas) decoder.end();
-  const texels = async (of: Atlas): Promise<Pages> => decoder.texels(await load('texels.bin'), of, surfels);
+  const { decodeSurfels, decodeTexels } = await import('./compact/decoder');
+  const surfels = await decodeSurfels(table, info, say);
+  const texels = async (of: Atlas): Promise<Pages> => decodeTexels(await load('texels.bin'), of, surfels, say);
   return { info, surfels, pages: null, later: info.atlas ? () => texels(info.atlas!) : null, cameras, photograph };
 }

@@ -21,7 +21,7 @@ from bitymi_ns.measure.report.records import (
     evaluation_from,
     link,
 )
-from bitymi_ns.measure.report.tables import COLUMNS
+from bitymi_ns.measure.report.tables import COLUMNS, FITTED
 from bitymi_ns.safe_reading import read_text as text_of
 from bitymi_ns.safe_reading import reading
 from bitymi_ns.trust import finite_numbers, json_of
@@ -116,7 +116,7 @@ def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
     try:
         for view in data["views"]:
             metrics = finite_numbers(view["metrics"])
-            figures = [f"{c.title} {c.text(metrics[c.key])}" for c in COLUMNS if c.key in metrics]
+            figures = [f"{c.title} {c.text(metrics[c.key])}" for c in (*COLUMNS, *FITTED) if c.key in metrics]
             rank = "worst" if view["rank"] == 1 else f"number {view['rank']} from below"
             title = f"{scene}, {method}: view {view['view']}, {rank} of {view['of']}: {', '.join(figures)}"
             files = view["files"].items()

@@ -79,17 +79,20 @@ COLUMNS = (
     Column("LPIPS", "lpips", "{:.3f}".format, "down"),
     Column("LPIPS (VGG)", "lpips_vgg", "{:.3f}".format, "down"),
     Column("FLIP", "flip", "{:.3f}".format, "down"),
-    Column("PSNR, mean exposure", "mean_exposure_psnr", "{:.2f}".format, "up"),
-    Column("PSNR fitted", "fitted_psnr", "{:.2f}".format, "up"),
-    Column("SSIM fitted", "fitted_ssim", "{:.3f}".format, "up"),
-    Column("LPIPS fitted", "fitted_lpips", "{:.3f}".format, "down"),
+    Column("Atlas MB", "atlas_bytes", megabytes, "down"),
+    Column("Bundle MB", "bundle_bytes", megabytes, "down"),
     Column("Points", "surfels", count, "down"),
     Column("Fragments / px", "fragments_per_pixel", significant, "down"),
     Column("ms", "render_ms", significant, "down"),
     Column("FPS", "frames_per_second", significant, "up"),
-    Column("Atlas MB", "atlas_bytes", megabytes, "down"),
-    Column("Bundle MB", "bundle_bytes", megabytes, "down"),
 )
+FITTED = (
+    Column("PSNR, mean exposure", "mean_exposure_psnr", "{:.2f}".format, "up"),
+    Column("PSNR fitted", "fitted_psnr", "{:.2f}".format, "up"),
+    Column("SSIM fitted", "fitted_ssim", "{:.3f}".format, "up"),
+    Column("LPIPS fitted", "fitted_lpips", "{:.3f}".format, "down"),
+)
+"""Columns of tables of their own, so that the others fit a window."""
 TRAINING = (
     Column("Training s", "train_seconds", count),
     Column("Training CPU s", "train_cpu_seconds", count),
@@ -204,14 +207,19 @@ def training_table(curves: list[Curve]) -> Table | None:
 
 
 def quality_tables(evaluations: list[Evaluation], training: bool = False) -> list[Table]:
-    """Build one table per scene and one of means over scenes; with the costs of training if `training`."""
+    """Build one table per scene and one of means over scenes, and the same of FITTED; with the costs of training if
+    `training`."""
     evaluations = [replace(row, results=shown_results(row, evaluations)) for row in evaluations]
-    wanted = (*COLUMNS, *(TRAINING if training else ()), Column("ΔPSNR", "psnr_delta", signed))
-    columns = [c for c in wanted if any(c.key in row.results for row in evaluations)]
-    scenes = sorted({row.scene for row in evaluations})
-    tables = [scene_table(scene, [e for e in evaluations if e.scene == scene], columns) for scene in scenes]
-    mean = mean_table(evaluations, columns)
-    return [*tables, mean] if mean else tables
+    main = (*COLUMNS, *(TRAINING if training else ()), Column("ΔPSNR", "psnr_delta", signed))
+    tables = []
+    for wanted, what in ((main, ""), (FITTED, ", exposure aside")):
+        rows = [row for row in evaluations if any(c.key in row.results for c in wanted)]
+        columns = [c for c in wanted if any(c.key in row.results for row in rows)]
+        for scene in sorted({row.scene for row in rows}):
+            tables.append(scene_table(scene + what, [row for row in rows if row.scene == scene], columns))
+        mean = mean_table(rows, columns)
+        tables += [replace(mean, title=mean.title + what)] if mean else []
+    return tables
 
 
 MOST_NAMED = 60  # maximum number of photographs in a table; report.json lists all

@@ -3,8 +3,9 @@
 from pathlib import Path
 
 from bitymi_ns.measure.report.records import evaluation_from
-from bitymi_ns.measure.report.tables import Row, Table, quality_tables, to_markdown
+from bitymi_ns.measure.report.tables import COLUMNS, FITTED, Row, Table, quality_tables, to_markdown
 from tests.measure.report.pages import page_of
+from tests.view.browser import drive, plain_server
 
 
 def make(scene="fox", method="bitymi", source="a/eval.json", **results):
@@ -18,12 +19,30 @@ def test_layout_before_and_after_baking():
         make(psnr=27.38, flip=0.12, render_ms=10.0, surfels=12345, atlas_bytes=2_500_000, method="bitymi-bundle"),
     ]
     (table,) = quality_tables(rows)
-    assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Points ↓", "ms ↓", "FPS ↑", "Atlas MB ↓", "ΔPSNR")
+    assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Atlas MB ↓", "Points ↓", "ms ↓", "FPS ↑", "ΔPSNR")
     before, trained, after, baked = table.rows
     assert before.section and after.section
-    assert trained.cells == ("bitymi", "27.40", "0.120", "12,345", "50.0", "20.0", "–", "–")
-    assert baked.cells == ("bitymi", "27.38", "0.120", "12,345", "10.0", "100", "2.50", "−0.020")
-    assert trained.best == {1} and baked.best == {4, 5}  # equal columns have no best
+    assert trained.cells == ("bitymi", "27.40", "0.120", "–", "12,345", "50.0", "20.0", "–")
+    assert baked.cells == ("bitymi", "27.38", "0.120", "2.50", "12,345", "10.0", "100", "−0.020")
+    assert trained.best == {1} and baked.best == {5, 6}  # equal columns have no best
+
+
+def test_bytes_are_in_sight_in_a_window_of_1280_pixels(tmp_path):
+    """With every column, in a browser."""
+    every = {column.key: 0.8881 for column in (*COLUMNS, *FITTED)}
+    every |= dict(psnr=27.4, fitted_psnr=27.4, surfels=1_234_567, render_ms=123.4, fragments_per_pixel=48.3)
+    every |= dict(atlas_bytes=123_456_789, bundle_bytes=23_456_789)
+    trained = {key: value for key, value in every.items() if "bytes" not in key}
+    rows = [make(method="bitymi-quality", **trained), make(method="bitymi-quality-bundle", **every)]
+    main, fitted = quality_tables(rows)
+    assert main.header[-1] == "ΔPSNR" and main.header.index("Bundle MB ↓") < main.header.index("Points ↓")
+    assert fitted.title == "fox, exposure aside"
+    assert [title for title in main.header if "fitted" in title or "mean" in title] == []
+    (tmp_path / "index.html").write_text(page_of(quality=[main, fitted]), "utf8")
+    wide = "[...document.querySelectorAll('.wide')].map((each) => each.scrollWidth - each.clientWidth)"
+    with plain_server(tmp_path, ranges=False) as (address, _):
+        found = drive([["goto", address], ["ask", wide]], (1280, 800), drawn=False)
+    assert found.results[-1] == [0, 0]
 
 
 def test_missing_values_are_dashes_and_never_best():

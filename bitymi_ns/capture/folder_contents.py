@@ -127,6 +127,15 @@ def photographs_below(folder: Path) -> Iterator[Path]:
         yield from filter(is_photograph, (Path(parent, name) for name in names))
 
 
+def unreadable_in(folder: Path) -> str:
+    """Say which folders in and below a folder cannot be listed, and why, as a sentence; empty = none."""
+    errors: list[OSError] = []
+    for _ in os.walk(folder, onerror=errors.append):
+        pass
+    names = listed([str(error.filename) for error in errors])
+    return f" {names} cannot be read: {errors[0].strerror}." if errors else ""
+
+
 def videos_in(folder: Path, rendered: bool = False) -> list[Path]:
     """List a folder's videos that are not hidden; `rendered`: films of ns-render instead."""
     names = (path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and not path.name.startswith("."))

@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.folder_contents import VIDEOS, refusal, videos_in
+from bitymi_ns.capture.folder_contents import VIDEOS, refusal, unreadable_in, videos_in
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.prepare import IMAGES, colmap_masks, emptied, upright_photos
@@ -93,7 +93,7 @@ def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
         held = {0: "no photographs", 1: "one photograph"}.get(len(names), f"{len(names)} photographs")
         raise CaptureError(
             f"{folder} holds {held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take "
-            f"photographs of which each shares at least two thirds with the one before.{also}"
+            f"photographs of which each shares at least two thirds with the one before.{unreadable_in(source) or also}"
         )
     below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if their common folder were given
     return source, folder / below, [os.path.relpath(name, below) for name in names]

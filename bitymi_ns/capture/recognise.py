@@ -284,7 +284,7 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         hint = f" It holds what is not taken for photographs: {listed(others)}."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "
-        f"no photographs and no video.{hint}"
+        f"no photographs and no video.{folder_contents.unreadable_in(data) or hint}"
     )
 
 

@@ -1,6 +1,9 @@
 """Results beside photographs are not read as photographs, and are named."""
 
+import errno
 import json
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -135,3 +138,20 @@ def test_raw_data_beside_photographs_do_not_count() -> None:
     names = ["a.DNG", "b.dng", "c.nef", "d.jxl", "a.jpg", "notes.txt"]
     assert pictures_among(names, ["a.jpg"]) == {".dng": 1, ".nef": 1, ".jxl": 1}
     assert pictures_among(["a.jpg"], ["a.jpg"]) == {}
+
+
+@pytest.mark.parametrize("read", [recognise, find_poses])
+def test_a_folder_that_cannot_be_listed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
+) -> None:
+    (tmp_path / "photos").mkdir()
+    scandir = os.scandir
+
+    def refused(path: Path) -> object:
+        if str(path).endswith("photos"):
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", refused)
+    with pytest.raises(CaptureError, match=f"{tmp_path / 'photos'} cannot be read: Permission denied"):
+        read(tmp_path)

@@ -149,6 +149,6 @@ def test_a_model_that_cannot_be_written_has_its_reason(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("before", ["", "signal.signal(15, lambda *_: os._exit(3)); "])
 def test_signals_end_a_program_as_before_it_read_a_capture(before: str) -> None:
-    program = f"import os, signal; {before}import bitymi_ns.capture.colmap_model; os.kill(os.getpid(), 15)"
+    program = f"import os, signal; {before}from bitymi_ns.capture import poses, read; os.kill(os.getpid(), 15)"
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True)
     assert (ended.returncode, ended.stderr) == (3 if before else -15, b"")

@@ -64,6 +64,7 @@ def test_one_file_is_shown(ranges: bool, tmp_path: Path) -> None:
         ("?file=none.bitymi", "There is no bundle"),
         ("?file=../scene.bitymi", "not the name"),
         ("?file=whole.bitymi", ""),
+        ("?file=photograph.bitymi", ""),
     ],
 )
 def test_another_file_beside_the_page(query: str, words: str, bundle: Path, tmp_path: Path) -> None:
@@ -73,11 +74,16 @@ def test_another_file_beside_the_page(query: str, words: str, bundle: Path, tmp_
     (site / "whole.bitymi").write_bytes(data)
     at = data.index(b"end_header") + 40  # in the rows of surfels.ply
     (site / "altered.bitymi").write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+    at = data.index(b"JFIF")  # of the photograph, which is not drawn
+    (site / "photograph.bitymi").write_bytes(data[:at] + b"x" + data[at + 1 :])
+    ask = [["ask", STATE], ["ask", "document.body.innerText"], ["ask", "document.title"]]
+    if "photograph" in query:
+        told = "document.getElementById('notice').textContent.includes('photograph-0001.jpg is altered')"
+        ask = [["press", "#beside"], ["until", told], *ask]
     with plain_server(site, True) as (address, _):
-        ask = [["ask", STATE], ["ask", "document.body.innerText"], ["ask", "document.title"]]
         found = drive([["goto", address + query], ["settle"], *ask], SCREEN, drawn=False)
     state, text, title = found.results[-3:]
     if words:
         assert state == "error" and words in text
     else:
-        assert state == "ready" and title == "whole"
+        assert state == "ready" and title == query[6:].removesuffix(".bitymi")

@@ -1,5 +1,6 @@
 // The viewer: state, drawing on change, and its controls.
 import type { Bundle } from './bundle/load';
+import { reasonOf } from './errors';
 import type { Vec3 } from './bundle/manifest';
 import type { Depths, DrawOptions, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
@@ -377,7 +378,10 @@ export class App implements Stage {
     element('photograph-name').textContent = photograph ? 'Photograph' : 'No photograph of this camera';
     const found = photograph ? this.bundle.photograph(photograph) : null;
     this.photograph = found;
-    found?.then((address) => this.photograph === found && (image.src = address), showError);
+    found?.then(
+      (address) => this.photograph === found && (image.src = address),
+      (error: unknown) => notify(reasonOf(error).message),
+    );
   }
 
   private async screenshot(): Promise<void> {

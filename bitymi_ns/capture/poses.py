@@ -132,14 +132,16 @@ def _find(
     photos = [photo for photo in photos if photo.name not in twins]
     seconds["reading photographs"] = time.monotonic() - read
     if len(photos) < LEAST:
-        if video:
+        alike = len(twins) >= len(left_out) - len(twins)
+        if video and alike:
             raise CaptureError(f"{source} {NO_MOTION}")
         some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
         some += f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
         use, then = "can be used", "copy or export them again"
-        if len(twins) >= len(left_out) - len(twins):
+        if alike:
             use, then = "differ", "take photographs from different places"
-        raise CaptureError(f"of the photographs in {folder}, only {len(photos)} {use} ({some}): {then}")
+        whose = f"frames of {source}" if video else f"photographs in {folder}"
+        raise CaptureError(f"of the {whose}, only {len(photos)} {use} ({some}): {then}")
     photos = ordered(photos)
     started = time.monotonic()
     images, used = upright_photos(photos, folder, work, tell)

@@ -216,6 +216,14 @@ def test_a_video_that_breaks_off_gives_what_it_has(
     assert re.search(line, caplog.text)
 
 
+def test_frames_that_cannot_be_used_are_named_with_the_reason(tmp_path: Path, wide: np.ndarray) -> None:
+    write_video(
+        tmp_path / "a.mp4", [np.asarray(Image.fromarray(each).resize((3000, 16))) for each in pan(wide, [16] * 12)]
+    )
+    with pytest.raises(CaptureError, match="of the frames of .*a.mp4, only 0 can be used .*only 3000 x 16 pixels"):
+        find_poses(tmp_path / "a.mp4")
+
+
 def test_frames_behind_damage_keep_their_numbers(
     tmp_path: Path, wide: np.ndarray, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -3,7 +3,7 @@
 import math
 import os
 from bisect import bisect_left, insort
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from itertools import islice
 from pathlib import Path
 
@@ -193,11 +193,25 @@ def _pictures(container: av.container.InputContainer) -> av.VideoStream:
 def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame]]:
     """Yield number, by the timestamps of all, and frame. Damaged frames and those drawn from them, up to the next key
     frame, are left out; at the end, a line says how many. Raises CaptureError: there are no others."""
+    line, last, lost = yield from _decoded(video, "AUTO", -1)
+    if lost:  # threads with a frame each lose some behind damage near the end
+        again, last, _ = yield from _decoded(video, "SLICE", last)
+        line = again or line
+    if line and last < 0:
+        raise CaptureError(f"{line} Record or export it again.")
+    if line:
+        warn(f"{line} Copy it again if you can.")
+
+
+def _decoded(video: Path, threads: str, last: int) -> Generator[tuple[int, av.VideoFrame], None, tuple[str, int, bool]]:
+    """Yield the frames behind number `last`; return a line on damage ("" = none), the last number, and whether frames
+    are missing."""
     with _opened(video) as container:
         stream = _pictures(container)
-        stream.thread_type = "AUTO"
+        stream.thread_type = threads
         stamps: list[int] = []  # of the packets
-        number, whole, damage, good, packets, hidden, end = -1, True, "", 0, -1, 0, 0.0  # the last packet is empty
+        number, whole, damage, end = -1, True, "", 0.0
+        good, bad, packets, hidden = 0, 0, -1, 0  # the last packet is empty
         try:
             for packet in container.demux(stream):
                 packets, hidden = packets + 1, hidden + packet.is_discard
@@ -207,25 +221,29 @@ def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame]]:
                 try:
                     frames = packet.decode()
                 except av.FFmpegError as error:
-                    whole, damage = False, error.strerror
+                    whole, damage, bad = False, error.strerror, bad + 1
                     continue
                 for frame in frames:
                     damage = damage or "its frames are damaged" * frame.is_corrupt
                     whole = not frame.is_corrupt and (whole or frame.key_frame)
+                    bad += not whole
                     if whole:
                         number = max(number + 1, 0 if frame.pts is None else bisect_left(stamps, frame.pts))
                         good, end = good + 1, frame.time or 0.0
-                        yield number, frame
+                        if number > last:
+                            yield number, frame
         except av.FFmpegError as error:
             damage = error.strerror
-        if damage and not good:
-            raise CaptureError(f"{video} cannot be decoded ({damage}): record or export it again")
         stated = stream.frames if container.format.name == "avi" else len(stream.index_entries)
-        count = max(stated, packets) - hidden
-        if count > good and (damage or stated > packets):
-            warn(f"{video} is damaged: {count - good} of its {count} frames are left out. Copy it again if you can.")
+        lost = stated - hidden - good if stated >= packets else bad  # a frame may have a packet per field
+        line = ""
+        if damage and not good:
+            line = f"{video} cannot be decoded: {damage}."
+        elif lost > 0 and (damage or stated > packets):
+            line = f"{video} is damaged: {lost} of its {good + lost} frames are left out."
         elif "matroska" in container.format.name and end < (length := (container.duration or 0) / 1e6) - 1.0:
-            warn(f"{video} ends early: its pictures last {end:.1f} of {length:.1f} seconds. Copy it again if you can.")
+            line = f"{video} ends early: its pictures last {end:.1f} of {length:.1f} seconds."
+        return line, number, lost > 0
 
 
 def _picture(frame: av.VideoFrame, shape: float = 1.0) -> Image.Image:

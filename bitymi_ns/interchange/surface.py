@@ -18,7 +18,6 @@ from bitymi_ns.ops import Prefilter, TexelAlpha, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import check_ranges
-from bitymi_ns.scene.baked import as_bytes
 from bitymi_ns.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -35,6 +34,7 @@ BOX_SIDE = 160  # longer side in pixels of the depth maps that determine the box
 PIXELS_PER_VOXEL = 2.0
 """Pixels per voxel at far depths: finer depth maps do not improve the volume."""
 FAR = 0.9  # quantile of a view's depths in the box used as far depth
+SAMPLED = 4  # open3d looks for voxels at every fourth pixel of a depth map, and fails without any
 POISSON_DEPTH = 9  # depth of the octree of the watertight reconstruction
 
 
@@ -158,29 +158,18 @@ def extract_surface(
             progress("finding the box", i + 1, len(small))
         box = observed_box(depths, small)
         voxel = float((box[1] - box[0]).max()) / options.resolution
-        volume = open3d.pipelines.integration.ScalableTSDFVolume(
-            voxel, TRUNCATION * voxel, open3d.pipelines.integration.TSDFVolumeColorType.RGB8
-        )
+        real = open3d.core.float32
+        # ScalableTSDFVolume of 0.20.0 fuses nothing
+        volume = open3d.t.geometry.VoxelBlockGrid(("tsdf", "weight", "color"), (real,) * 3, ((1), (1), (3)), voxel)
         for i, camera in enumerate(cameras):
             inside = _cut(depths[i], small[i], box)
             far = inside[inside > 0].quantile(FAR).item() if inside.any() else 0.0
             camera = _coarsened(camera, PIXELS_PER_VOXEL * far / voxel)
             depth = _cut(median_depth(surfels, camera, near, prefilter, alpha).cpu(), camera, box)
-            rgb = as_bytes(render(camera)).numpy()
-            picture = open3d.geometry.RGBDImage.create_from_color_and_depth(
-                open3d.geometry.Image(np.ascontiguousarray(rgb)),
-                open3d.geometry.Image(np.ascontiguousarray(depth.float().numpy())),
-                depth_scale=1.0,
-                depth_trunc=math.inf,
-                convert_rgb_to_intensity=False,
-            )
-            K = camera.K.cpu().double()
-            # open3d samples pixels at integer coordinates, this package at + 0.5
-            pinhole = (K[0, 0].item(), K[1, 1].item(), K[0, 2].item() - 0.5, K[1, 2].item() - 0.5)
-            intrinsic = open3d.camera.PinholeCameraIntrinsic(camera.width, camera.height, *pinhole)
-            volume.integrate(picture, intrinsic, camera.viewmat.cpu().double().numpy())
+            if bool((depth[::SAMPLED, ::SAMPLED] > 0).any()):
+                _integrate(volume, camera, depth, render(camera))
             progress("fusing depth maps", i + 1, len(cameras))
-        mesh = volume.extract_triangle_mesh()
+        mesh = _in_order(volume.extract_triangle_mesh(0.0))
         if not len(mesh.triangles):
             raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
         return _postprocess(mesh, options, progress, to)
@@ -200,6 +189,32 @@ def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:
     cut = torch.zeros_like(depth)
     cut[known] = torch.where(inside, depth[known], 0.0)
     return cut
+
+
+def _integrate(volume: open3d.t.geometry.VoxelBlockGrid, camera: Camera, depth: Tensor, rgb: Tensor) -> None:
+    import open3d
+
+    K, viewmat = camera.K.cpu().double(), camera.viewmat.cpu().double()
+    K[:2, 2] -= 0.5  # open3d samples pixels at integer coordinates, this package at + 0.5
+    K, viewmat = open3d.core.Tensor(K.numpy()), open3d.core.Tensor(viewmat.numpy())
+    maps = (np.ascontiguousarray(each.float().numpy()) for each in (depth, rgb.clamp(0.0, 1.0).cpu()))
+    depth, rgb = (open3d.t.geometry.Image(open3d.core.Tensor(each)) for each in maps)
+    limits = (1.0, math.inf, TRUNCATION)  # the depth's unit, and the farthest
+    blocks = volume.compute_unique_block_coordinates(depth, K, viewmat, *limits)
+    volume.integrate(blocks, depth, rgb, K, K, viewmat, *limits)
+
+
+def _in_order(mesh: open3d.t.geometry.TriangleMesh) -> open3d.geometry.TriangleMesh:
+    """Sort vertices, joined where they fall together, and triangles, which come in the order of open3d's threads."""
+    import open3d
+
+    vertices, first, into = np.unique(mesh.vertex.positions.numpy(), axis=0, return_index=True, return_inverse=True)
+    faces = into.ravel()[mesh.triangle.indices.numpy()]
+    sorted_mesh = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(vertices), open3d.utility.Vector3iVector(faces[np.lexsort(faces.T)])
+    )
+    sorted_mesh.vertex_colors = open3d.utility.Vector3dVector(mesh.vertex.colors.numpy()[first])
+    return sorted_mesh.remove_degenerate_triangles()
 
 
 def _postprocess(

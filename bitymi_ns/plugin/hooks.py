@@ -67,9 +67,12 @@ HOST_OPTION = "--viewer.websocket-host"
 def allow_numpy_scalars() -> None:
     """Let torch.load's safe mode read numpy's numbers.
 
-    Changes: torch's list of safe types. For: commands that load a run. Without: checkpoints whose schedulers left such
-    numbers do not load with torch 2.6 or later. Superfluous once nerfstudio saves plain numbers.
+    Changes: torch's list of safe types, which it has since 2.4. For: commands that load a run. Without: checkpoints
+    whose schedulers left such numbers do not load with torch 2.6 or later. Superfluous once nerfstudio saves plain
+    numbers.
     """
+    if not hasattr(torch.serialization, "add_safe_globals"):
+        return
     try:
         from numpy._core.multiarray import scalar
     except ImportError:  # numpy 1

@@ -35,23 +35,28 @@ def _specification(name: str) -> MethodSpecification:
 
 
 def _install() -> None:
-    """Make the changes that nerfstudio's registry has no place for; see `hooks`."""
+    """Make the changes that nerfstudio's registry has no place for, each whether or not the others fail; see `hooks`."""
     try:
         from bitymi_ns.plugin import hooks
         from bitymi_ns.plugin.run import torchrun
-
-        CONSOLE.quiet = CONSOLE.quiet or not torchrun.own().first  # of several processes the first prints
-        hooks.allow_numpy_scalars()
-        hooks.read_names_of_callers()
-        hooks.extend_exporter(_exports)
     except Exception as error:  # noqa: BLE001 - see the module's docstring
-        warnings.warn(
-            "bitymi-ns: `ns-export bitymi-atlas` is not available, and checkpoints of nerfstudio's own methods may not "
-            f"load ({type(error).__name__}: {error})",
-            stacklevel=1,
-        )
+        _warn("`ns-export bitymi-atlas` is not available", error)
         return
+    CONSOLE.quiet = CONSOLE.quiet or not torchrun.own().first  # of several processes the first prints
+    for change, lost in (
+        (hooks.allow_numpy_scalars, "checkpoints of nerfstudio's own methods may not load"),
+        (hooks.read_names_of_callers, "commands start slowly"),
+        (lambda: hooks.extend_exporter(_exports), "`ns-export bitymi-atlas` is not available"),
+    ):
+        try:
+            change()
+        except Exception as error:  # noqa: BLE001 - see the module's docstring
+            _warn(lost, error)
     hooks.refuse_without_config()
+
+
+def _warn(lost: str, error: Exception) -> None:
+    warnings.warn(f"bitymi-ns: {lost} ({type(error).__name__}: {error})", stacklevel=2)
 
 
 def _exports() -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,9 +23,18 @@ BETAS = (0.9, 0.999)  # Adam's betas of surfel parameters
 FIELD_BETAS = (0.9, 0.99)  # those of the texture field, whose gradients are sparse, and large early on
 
 
-def adam(parameters: list[torch.nn.Parameter], betas: tuple[float, float] = BETAS) -> Adam:
-    """Create a fused Adam optimiser with the method's epsilon."""
-    return Adam(parameters, lr=0.0, betas=betas, eps=EPS, fused=True)
+def adam(parameters: list[Parameter], betas: tuple[float, float] = BETAS, rate: float = 0.0, eps: float = EPS) -> Adam:
+    """Create an Adam optimiser, fused where torch can: on the CPU since 2.4."""
+    return Adam(parameters, lr=rate, betas=betas, eps=eps, fused=_fuses(parameters[0].device.type))
+
+
+@functools.cache
+def _fuses(device: str) -> bool:
+    try:
+        Adam([torch.zeros(1, device=device)], fused=True)
+    except RuntimeError:
+        return False
+    return True
 
 
 def surfel_optimizers(scene: Scene) -> dict[str, Adam]:

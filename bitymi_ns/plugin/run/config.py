@@ -14,6 +14,8 @@ from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, Mac
 from nerfstudio.engine.optimizers import OptimizerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
+from torch.nn import Parameter
+from torch.optim import Adam
 
 from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
@@ -28,7 +30,7 @@ from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.ranges import check_ranges
-from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS
+from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS, adam
 from bitymi_ns.train.preset import load_preset
 
 SEEDS = 1 << 32  # end of numpy's range of seeds
@@ -229,14 +231,17 @@ class BitymiAdamConfig(OptimizerConfig):
     """Adam; the preset's schedule sets the learning rate at every step."""
 
     betas: tuple[float, float] = BETAS  # Decay of the running averages.
-    fused: bool = True  # Update all entries of a tensor in one pass.
+
+    def setup(self, params: list[Parameter]) -> Adam:
+        """Create the optimiser as this torch can: config.yml may have been written with another."""
+        return adam(params, self.betas, self.lr, self.eps)
 
 
 def method_config(name: str) -> MethodSpecification:
     """Make the registry entry of a preset."""
     preset = load_preset(name)
 
-    def adam(group: str) -> BitymiAdamConfig:
+    def optimizer(group: str) -> BitymiAdamConfig:
         return BitymiAdamConfig(lr=1e-3, eps=EPS, betas=FIELD_BETAS if group.startswith("field") else BETAS)
 
     config = BitymiTrainerConfig(
@@ -250,7 +255,7 @@ def method_config(name: str) -> MethodSpecification:
             model=BitymiModelConfig(scene=preset.scene, train=preset.train),
         ),
         # one optimiser per parameter group, no scheduler: the model sets the rates
-        optimizers={group: {"optimizer": adam(group), "scheduler": None} for group in PARAMETER_GROUPS},
+        optimizers={group: {"optimizer": optimizer(group), "scheduler": None} for group in PARAMETER_GROUPS},
         # a progress bar replaces the table; profiles of nerfstudio's functions say nothing about ours
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         viewer=ViewerConfig(websocket_host=hooks.LOOPBACK, quit_on_train_completion=True),

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
+from torch.utils._pytree import tree_flatten
 
 from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bake.state import BakeState
@@ -205,7 +205,7 @@ class Peak(TorchDispatchMode):
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
         made = func(*args, **(kwargs or {}))
-        for tensor in tree_leaves(made):
+        for tensor in tree_flatten(made)[0]:
             if isinstance(tensor, torch.Tensor):
                 self._live[StorageWeakRef(tensor.untyped_storage())] = tensor.untyped_storage().nbytes()
         self._live = {storage: size for storage, size in self._live.items() if not storage.expired()}

@@ -57,7 +57,7 @@ foreach(cpu ${BITYMI_MARCH})
     string(MAKE_C_IDENTIFIER "_cpu_${cpu}" name)
   endif()
   # NOMINSIZE: nanobind otherwise compiles its modules with -Os.
-  nanobind_add_module(${name} NB_STATIC NOMINSIZE ${cpu_sources})
+  nanobind_add_module(${name} NB_STATIC NOMINSIZE NB_DOMAIN ${name} ${cpu_sources})
   target_include_directories(${name} PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
   set(features "")
   if(CMAKE_CXX_COMPILER_ID MATCHES "GNU|Clang")

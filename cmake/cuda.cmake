@@ -15,7 +15,7 @@ if(BITYMI_EMULATED_CUDA)
   endforeach()
   # what a card would refuse; the emulator says where
   set_source_files_properties(${emulated_kernels} PROPERTIES COMPILE_OPTIONS -fsanitize=alignment)
-  nanobind_add_module(_emulated NB_STATIC NOMINSIZE ${emulated_sources} ${emulated_kernels} ${cuda_bindings})
+  nanobind_add_module(_emulated NB_STATIC NOMINSIZE NB_DOMAIN _emulated ${emulated_sources} ${emulated_kernels} ${cuda_bindings})
   target_include_directories(_emulated PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
   target_compile_definitions(_emulated PRIVATE BITYMI_EMULATED)
   target_compile_options(_emulated PRIVATE -O2 -Wall -Wextra -ffp-contract=off)
@@ -88,7 +88,7 @@ target_compile_options(bitymi_cuda PRIVATE --expt-relaxed-constexpr -Xcompiler=-
 # would differ in the last bit, and now and then by a tile.
 set_source_files_properties(${CMAKE_CURRENT_SOURCE_DIR}/csrc/cuda/bin.cu PROPERTIES COMPILE_OPTIONS --fmad=false)
 find_package(CUDAToolkit REQUIRED)
-nanobind_add_module(_cuda NB_STATIC NOMINSIZE ${cuda_bindings})
+nanobind_add_module(_cuda NB_STATIC NOMINSIZE NB_DOMAIN _cuda ${cuda_bindings})
 target_include_directories(_cuda PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
 target_link_libraries(_cuda PRIVATE bitymi_cuda CUDA::cudart_static)
 install(TARGETS _cuda LIBRARY DESTINATION bitymi_ns)

@@ -19,7 +19,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 SITE_PACKAGES = Path(sysconfig.get_path("purelib"))
 KERNELS = "tests/ops/test_kernels.py"
-TESTS = ("tests/test_presets.py", "tests/ops/test_backend.py", KERNELS, "tests/plugin/test_registration.py")
+TESTS = (
+    *("tests/test_presets.py", "tests/ops/test_backend.py", KERNELS, "tests/plugin/test_registration.py"),
+    *("tests/ops/test_constants.py", "tests/codec/test_streams.py", "tests/bundle/test_compact.py"),
+)
 
 WHERE = """
 import sys

@@ -33,7 +33,9 @@ Check = Callable[[tuple[int, ...]], None]
 """Receives a header's shape, and raises if it must not be read."""
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 EXR = b"v/1\x01"
-cv2.setLogLevel(0)  # a damaged map gets one message, without OpenCV's own
+(getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(
+    0
+)  # a damaged map gets one message, without OpenCV's
 _PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
 
 Values = npt.NDArray[np.float32]
@@ -146,16 +148,35 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
             values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
         else:
             check(image_shape(path))
-            os.environ.setdefault("OPENCV_IO_ENABLE_OPENEXR", "1")  # OpenCV has the reader, switched off
-            values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-            if values is None:
-                raise ValueError("it is no image that OpenCV reads")
+            values = _read_exr(path) if path.suffix.lower() == ".exr" else _read_by_opencv(path)
             check(values.shape)
-            if values.ndim == 3:
-                values = values[..., [2, 1, 0] if _channels_differ(values) else 0]  # equal: depth, written as grey
+            if values.ndim == 3 and not _channels_differ(values):
+                values = values[..., 0]  # depth, written as grey
     if values.dtype.kind not in "iuf":
         fail(f"{path} is no map of numbers, but of {values.dtype}. {_WITHOUT}")
     return values.astype(np.float32) if values.dtype.itemsize > 4 or values.dtype == np.float16 else values
+
+
+def _read_by_opencv(path: Path) -> npt.NDArray[np.generic]:
+    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise ValueError("it is no image that OpenCV reads")
+    return values if values.ndim == 2 else values[..., 2::-1]  # BGR, BGRA
+
+
+def _read_exr(path: Path) -> npt.NDArray[np.generic]:
+    import OpenEXR  # OpenCV 5 reads no such files, and 4 reads a channel Z as zeros
+
+    with open_regular(path) as file:
+        image = OpenEXR.InputFile(file)
+        kinds = {name: ("u4", "f2", "f4")[channel.type.v] for name, channel in image.header()["channels"].items()}
+        names = next(each for each in ("RGB", "Y", "Z", list(kinds)) if kinds.keys() >= set(each))
+        if len(names) != 1 and names != "RGB":
+            raise ValueError(f"R, G and B, Y, Z or a single channel are read, and it has {', '.join(kinds)}")
+        planes = zip(names, image.channels(list(names)), strict=True)
+        shape = image_shape(path)
+        values = np.stack([np.frombuffer(plane, kinds[name]).reshape(shape) for name, plane in planes], axis=-1)
+    return values if len(names) == 3 else values[..., 0]
 
 
 def read_array(path: Path, check: Check) -> npt.NDArray[np.generic]:

@@ -35,7 +35,7 @@ def _specification(name: str) -> MethodSpecification:
 
 
 def _install() -> None:
-    """Make the changes that nerfstudio's registry has no place for, each whether or not the others fail; see `hooks`."""
+    """Make the changes that nerfstudio's registry has no place for, each even if another fails; see `hooks`."""
     try:
         from bitymi_ns.plugin import hooks
         from bitymi_ns.plugin.run import torchrun

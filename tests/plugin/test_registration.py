@@ -15,7 +15,7 @@ import yaml
 from nerfstudio.plugins.types import MethodSpecification
 
 import bitymi_ns.plugin.run.config as config
-from bitymi_ns.plugin import methods
+from bitymi_ns.plugin import hooks, methods
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 
 NAMES = ["bitymi", *(f"bitymi-{name}" for name in ("quality", "fast", "sb", "sg", "sh", "field", "notexture"))]
@@ -111,6 +111,32 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
         importlib.reload(methods)
 
 
+CHANGES = ("allow_numpy_scalars", "read_names_of_callers", "extend_exporter", "refuse_without_config")
+
+
+@pytest.mark.parametrize("failing", CHANGES[:3])
+def test_a_change_of_nerfstudio_that_fails_takes_no_other_with_it(
+    monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    made = []
+
+    def change(name: str) -> None:
+        made.append(name)
+        if name == failing:
+            raise AttributeError("no such thing")
+
+    for name in CHANGES:
+        monkeypatch.setattr(hooks, name, lambda *_, name=name: change(name))
+    with pytest.warns(UserWarning, match="AttributeError: no such thing"):
+        methods._install()
+    assert made == list(CHANGES)
+
+
+def test_a_torch_without_a_list_of_safe_types_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(torch.serialization, "add_safe_globals", raising=False)
+    hooks.allow_numpy_scalars()
+
+
 OLD_MODULES = {
     **{f"plugin.data.{name}": f"host.{name}" for name in ("datamanager", "dataparser", "dataset")},
     "plugin.run.model": "host.model",
@@ -129,7 +155,8 @@ def test_a_config_of_an_earlier_version_loads(model: BakedModelConfig | None) ->
     for new, old in OLD_MODULES.items():
         text = text.replace(f"bitymi_ns.{new}", f"bitymi_ns.{old}")
     assert "plugin" not in text
-    text = re.sub("( +)falloff_gamma", r"\1falloff_error: l1_sum\n\1falloff_gamma", text)  # a removed option
+    text = re.sub("( +)falloff_gamma", r"\1falloff_error: l1_sum\n\1falloff_gamma", text)  # removed options
+    text = re.sub("( +)max_norm", r"\1fused: true\n\1max_norm", text)
     assert yaml.load(text, yaml.Loader) == run
 
 

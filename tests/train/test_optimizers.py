@@ -5,6 +5,7 @@ import torch
 from torch.nn import Parameter
 from torch.optim import SGD, Adam, Optimizer
 
+from bitymi_ns.train import optimizers as module
 from bitymi_ns.train.optimizers import adam, forget_gradients, step
 
 RATES = (1e-2, 1e-2, 3e-4, 0.0)
@@ -69,3 +70,26 @@ def test_steps_of_rows_are_scaled() -> None:
             by = factor[:, None] if i == 0 else 1.0
             a_moved, b_moved = moved
             torch.testing.assert_close(a_moved, by * b_moved, rtol=1e-4, atol=1e-6)
+
+
+def test_where_torch_has_no_fused_adam_each_steps_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As before torch 2.4 on the CPU."""
+
+    class Older(Adam):
+        def __init__(self, *args, fused: bool, **options) -> None:
+            if fused:
+                raise RuntimeError("`fused=True` requires all the params to be on supported devices: ['cuda']")
+            super().__init__(*args, fused=fused, **options)
+
+    fused = optimizers()
+    with monkeypatch.context() as older:
+        older.setattr(module, "Adam", Older)
+        older.setattr(module, "_fuses", module._fuses.__wrapped__)
+        plain = optimizers()
+        for given in (fused, plain):
+            g = torch.Generator().manual_seed(1)
+            for p in 3 * parameters_of(given):
+                p.grad = torch.randn(p.shape, generator=g)
+                step(given, {})
+    for a, b in zip(parameters_of(fused), parameters_of(plain), strict=True):
+        torch.testing.assert_close(a, b)

@@ -8,6 +8,8 @@
 # make clang-test  the same tests with the CPU kernels as Clang compiles them (CLANG=clang++)
 # make baseline-test  the same tests with the CPU kernels for any CPU of this kind: on x86-64 without AVX
 # make wheel-test  builds the wheel, without CUDA, looks into it and runs tests against it in an environment of its own
+# make test-environment  installs the wheel beside the oldest and the newest packages, runs tests and commands there, and
+#              records the versions (8 GB and half an hour each); ENDS=oldest or newest: one of them; DATA=capture
 # make wheel   builds a wheel in dist/; with CUDA=1 one that has the kernels for cards of compute capability 7.5 to 12.0
 #              (ARCHITECTURES) and needs nvcc here, not where it is installed
 # make gate    trains, bakes and draws a fixed small scene (and DATA=folder) and compares quality, bytes, memory and time
@@ -31,6 +33,7 @@ WORK   ?= outputs/bench
 CLANG  ?= clang++
 WORKERS ?= $(shell n=$$(nproc 2>/dev/null || echo 1); echo $$((n < 8 ? n : 8)))
 TESTS  ?= tests/ops tests/stress tests/scene
+ENDS   ?= oldest newest
 CUDA   ?=
 ARCHITECTURES ?= 75;80;86;89;90;100;120
 
@@ -46,7 +49,7 @@ CMAKE_ARGS  := $(DEFINE).BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test gate gate-accept wheel wheel-test sanitize clang-test baseline-test bench web web-test web-test-here lint format clean
+.PHONY: setup demo test gate gate-accept wheel wheel-test test-environment sanitize clang-test baseline-test bench web web-test web-test-here lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -136,6 +139,9 @@ $(BIN)/cmake -S . -B build/$(1) -G Ninja $(2) -DBITYMI_CUDA=OFF \
 $(BIN)/cmake --build build/$(1)
 $(BIN)/python scripts/test_build.py $(3) build/$(1) $(TESTS)
 endef
+
+test-environment:
+	$(PYTHON) scripts/test_environment.py $(ENDS) --work outputs/environments $(if $(DATA),--data "$(DATA)")
 
 sanitize: setup
 	$(call test_build,sanitize,-DBITYMI_SANITIZE=ON,--sanitizers)

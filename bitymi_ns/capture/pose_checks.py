@@ -79,7 +79,7 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
             what = f"the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers"
             fail(f"{path}: {what}. Correct it or remove the frame.")
         if pose[3, 3] and not pose[3, :3].any():
-            scaled += [name] * (abs(pose[3, 3] - 1.0) > 1e-6)
+            scaled += [name] * bool(abs(pose[3, 3] - 1.0) > 1e-6)  # numpy 2.5 multiplies no list by its own
             pose = pose / pose[3, 3]  # homogeneous: a factor on all 16 numbers says nothing
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             row = " ".join(f"{x:g}" for x in pose[3])

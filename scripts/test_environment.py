@@ -1,0 +1,129 @@
+#!/usr/bin/env python3
+"""Install the wheel beside the oldest and the newest packages that are supported, and try it there:
+scripts/test_environment.py [--data CAPTURE] [--work FOLDER] [oldest] [newest]
+
+The oldest is nerfstudio's documented environment, in which pip must change nothing. The newest is what pip gives
+without constraints.txt, and then the newest releases of what nerfstudio's requirements hold back. The versions found
+are written to scripts/environments, which tests/scripts compares with pyproject.toml."""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FOUND = ROOT / "scripts" / "environments"
+NERFSTUDIO = "nerfstudio==1.1.5"
+ENDS = {
+    "oldest": ("3.10", [["torch==2.1.2", "torchvision==0.16.2"], [NERFSTUDIO]], []),
+    "newest": ("3.12", [[NERFSTUDIO]], ["torch", "torchvision", "numpy", "opencv-python-headless", "open3d", "av"]),
+}
+"""By name: the Python, what is installed before the wheel, and what is renewed after it whatever requires less."""
+KEPT = {"torch", "torchvision", "numpy", "gsplat", "nerfacc", "opencv-python-headless", "open3d"}
+TESTS = [f"tests/{name}" for name in "codec ops train scene bundle interchange plugin capture bake".split()]
+SHORT, LONG = 100, 120  # steps of the run, and of the one that goes on with it
+
+
+class Environment:
+    """A new virtual environment in `folder`, outside the checkout."""
+
+    def __init__(self, interpreter: str, folder: Path) -> None:
+        self.folder = folder
+        subprocess.run([interpreter, "-m", "venv", "--clear", folder / "venv"], check=True)
+
+    def run(self, program: str, *words: object, cwd: Path | None = None) -> str:
+        """Run a program of the environment and return its output; exit if it fails."""
+        found = self.folder / "venv" / "bin"
+        variables = {"OMP_NUM_THREADS": "2"} | os.environ | {"PATH": f"{found}:{os.environ['PATH']}"}
+        print("+", program, *words, flush=True)
+        command = [found / program, *map(str, words)]
+        done = subprocess.run(
+            command, cwd=cwd or self.folder, env=variables, stdout=subprocess.PIPE, text=True, check=False
+        )
+        if done.returncode:
+            sys.exit(f"{done.stdout}\ntest environment: exit status {done.returncode} of {program} in {self.folder}")
+        return done.stdout
+
+    def pip(self, *words: object) -> str:
+        return self.run("python", "-m", "pip", "--disable-pip-version-check", *words)
+
+    def versions(self) -> dict[str, str]:
+        """Return the installed packages' versions by name, in lower case."""
+        pairs = (line.split("==") for line in self.pip("list", "--format=freeze").splitlines())
+        return {name.lower().replace("_", "-"): version for name, version in sorted(pairs)}
+
+
+def interpreter_of(version: str) -> str:
+    """Find a Python on PATH; exit with its name if there is none."""
+    return shutil.which(f"python{version}") or sys.exit(
+        f"No 'python{version}' found on PATH: install Python {version} with its venv module, or leave this end out by "
+        "naming the other one"
+    )
+
+
+def try_commands(environment: Environment, data: Path | None) -> None:
+    """Train a capture, or the sample room, go on with the run, evaluate and export it."""
+    folder, train = environment.folder, ["bitymi", "--vis", "tensorboard", "--output-dir", "runs", "--timestamp", "run"]
+    if data is None:
+        data = folder / "room"
+        environment.run("bitymi", "sample", "--output-dir", data)
+    for steps, name, more in (
+        (SHORT, "short", []),
+        (LONG, "long", ["--load-dir", "runs/short/bitymi/run/nerfstudio_models"]),
+    ):
+        options = ["--experiment-name", name, "--max-num-iterations", steps, *more]
+        environment.run("ns-train", *train, "--data", data, *options)
+    config = ["--load-config", "runs/long/bitymi/run/config.yml"]
+    environment.run("ns-eval", *config, "--output-path", "eval.json")
+    print((folder / "eval.json").read_text())
+    environment.run("ns-export", "bitymi-atlas", *config, "--output-dir", "bundle")
+    environment.run("ns-eval", "--load-config", "bundle/config.yml", "--output-path", "bundle.json")
+    environment.run("ns-export", "bitymi-mesh", *config, "--output-dir", "mesh")
+
+
+def try_end(name: str, work: Path, data: Path | None) -> None:
+    """Make the environment, install the wheel, run tests and commands, and write the versions found."""
+    version, first, renewed = ENDS[name]
+    environment = Environment(interpreter_of(version), work / name)
+    for packages in first:
+        environment.pip("install", "-q", *packages)
+    before = environment.versions()
+    environment.pip("wheel", "-q", "--no-deps", "--config-settings=cmake.define.BITYMI_CUDA=OFF", "-w", "dist", ROOT)
+    (wheel,) = (environment.folder / "dist").glob("*.whl")
+    environment.pip("install", "-q", wheel)
+    after = environment.versions()
+    print(f"{name}: pip adds {sorted(after.keys() - before.keys())}")
+    if changed := {each for each in before if after.get(each) != before[each]} & KEPT:
+        sys.exit(f"test environment: pip changes {sorted(changed)} of the {name} environment")
+    if renewed:
+        environment.pip("install", "-q", "--upgrade", "--no-deps", *renewed)
+    found = "".join(f"{each}=={version}\n" for each, version in environment.versions().items())
+    environment.pip("install", "-q", "pytest", "hypothesis", "plyfile", "texture2ddecoder")
+    away = environment.folder / "away"
+    shutil.rmtree(away, ignore_errors=True)
+    shutil.copytree(
+        ROOT, away, ignore=shutil.ignore_patterns(".*", "__pycache__", "build", "bitymi_ns", "node_modules")
+    )
+    print(environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *TESTS, cwd=away))
+    try_commands(environment, data)
+    python = environment.run("python", "-c", "import platform; print(platform.python_version())").strip()
+    (FOUND / f"{name}.txt").write_text(f"# Python {python}: written by scripts/test_environment.py\n{found}", "utf8")
+
+
+def main() -> None:
+    """Try the environments named, or both; find their interpreters first."""
+    parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
+    parser.add_argument("ends", nargs="*", default=list(ENDS), choices=list(ENDS), metavar="oldest|newest")
+    parser.add_argument("--data", type=Path, help="a capture; the sample room without")
+    parser.add_argument("--work", type=Path, required=True, help="folder of the environments, outside the checkout")
+    options = parser.parse_args()
+    for name in options.ends:
+        interpreter_of(ENDS[name][0])
+    for name in options.ends:
+        try_end(name, options.work.absolute(), options.data and options.data.absolute())
+
+
+if __name__ == "__main__":
+    main()

@@ -141,7 +141,7 @@ $(BIN)/python scripts/test_build.py $(3) build/$(1) $(TESTS)
 endef
 
 test-environment:
-	$(PYTHON) scripts/test_environment.py $(ENDS) --work outputs/environments $(if $(DATA),--data "$(DATA)")
+	$(PYTHON) scripts/test_environment.py $(addprefix --end ,$(ENDS)) --work outputs/environments $(if $(DATA),--data "$(DATA)")
 
 sanitize: setup
 	$(call test_build,sanitize,-DBITYMI_SANITIZE=ON,--sanitizers)

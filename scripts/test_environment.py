@@ -1,6 +1,6 @@
 #!/usr/bin/env python3
 """Install the wheel beside the oldest and the newest packages that are supported, and try it there:
-scripts/test_environment.py [--data CAPTURE] [--work FOLDER] [oldest] [newest]
+scripts/test_environment.py --work FOLDER [--data CAPTURE] [--end oldest|newest]
 
 The oldest is nerfstudio's documented environment, in which pip must change nothing. The newest is what pip gives
 without constraints.txt, and then the newest releases of what nerfstudio's requirements hold back. The versions found
@@ -58,8 +58,8 @@ class Environment:
 def interpreter_of(version: str) -> str:
     """Find a Python on PATH; exit with its name if there is none."""
     return shutil.which(f"python{version}") or sys.exit(
-        f"No 'python{version}' found on PATH: install Python {version} with its venv module, or leave this end out by "
-        "naming the other one"
+        f"No 'python{version}' found on PATH: install Python {version} with venv, or name the other end alone "
+        "(make test-environment ENDS=...)"
     )
 
 
@@ -115,13 +115,14 @@ def try_end(name: str, work: Path, data: Path | None) -> None:
 def main() -> None:
     """Try the environments named, or both; find their interpreters first."""
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
-    parser.add_argument("ends", nargs="*", default=list(ENDS), choices=list(ENDS), metavar="oldest|newest")
+    parser.add_argument("--end", action="append", choices=list(ENDS), help="one of the two; may be repeated")
     parser.add_argument("--data", type=Path, help="a capture; the sample room without")
     parser.add_argument("--work", type=Path, required=True, help="folder of the environments, outside the checkout")
     options = parser.parse_args()
-    for name in options.ends:
+    ends = options.end or list(ENDS)
+    for name in ends:
         interpreter_of(ENDS[name][0])
-    for name in options.ends:
+    for name in ends:
         try_end(name, options.work.absolute(), options.data and options.data.absolute())
 
 

@@ -316,7 +316,7 @@ def test_numbers_in_quotes_are_numbers(wall: Wall, camera_path: Any, tmp_path: P
     camera_path(camera_path_filename=tmp_path / "words.json")
     assert [(camera.width, camera.height) for camera in wall.drawn] == [(32, 24)] * 2
     assert [camera.K[:2, 2].tolist() for camera in wall.drawn] == [[8, 18], [16, 12]]
-    assert decoded(tmp_path / "film.mp4")[0].average_rate == 4
+    assert decoded(tmp_path / "film.mp4")[0][2] == 4
 
 
 def test_frames_that_show_nothing_are_counted(

@@ -18,7 +18,7 @@ FOUND = ROOT / "scripts" / "environments"
 NERFSTUDIO = "nerfstudio==1.1.5"
 ENDS = {
     "oldest": ("3.10", [["torch==2.1.2", "torchvision==0.16.2"], [NERFSTUDIO]], []),
-    "newest": ("3.12", [[NERFSTUDIO]], ["torch", "torchvision", "numpy", "opencv-python-headless", "open3d", "av"]),
+    "newest": ("3.12", [[NERFSTUDIO]], ["numpy", "opencv-python-headless", "open3d", "av"]),
 }
 """By name: the Python, what is installed before the wheel, and what is renewed after it whatever requires less."""
 KEPT = {"torch", "torchvision", "numpy", "gsplat", "nerfacc", "opencv-python-headless", "open3d"}
@@ -31,7 +31,8 @@ class Environment:
 
     def __init__(self, interpreter: str, folder: Path) -> None:
         self.folder = folder
-        subprocess.run([interpreter, "-m", "venv", "--clear", folder / "venv"], check=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        subprocess.run([interpreter, "-m", "venv", folder / "venv"], check=True)
 
     def run(self, program: str, *words: object, cwd: Path | None = None) -> str:
         """Run a program of the environment and return its output; exit if it fails."""
@@ -84,7 +85,7 @@ def try_commands(environment: Environment, data: Path | None) -> None:
 
 
 def try_end(name: str, work: Path, data: Path | None) -> None:
-    """Make the environment, install the wheel, run tests and commands, and write the versions found."""
+    """Make the environment, install the wheel, write the versions found, and run commands and tests."""
     version, first, renewed = ENDS[name]
     environment = Environment(interpreter_of(version), work / name)
     for packages in first:
@@ -100,16 +101,20 @@ def try_end(name: str, work: Path, data: Path | None) -> None:
     if renewed:
         environment.pip("install", "-q", "--upgrade", "--no-deps", *renewed)
     found = "".join(f"{each}=={version}\n" for each, version in environment.versions().items())
+    python = environment.run("python", "-c", "import platform; print(platform.python_version())").strip()
+    (FOUND / f"{name}.txt").write_text(f"# Python {python}: written by scripts/test_environment.py\n{found}", "utf8")
+    try_commands(environment, data)
+    try_tests(environment)
+
+
+def try_tests(environment: Environment) -> None:
+    """Run tests on a copy of the checkout without the package."""
     environment.pip("install", "-q", "pytest", "hypothesis", "plyfile", "texture2ddecoder")
     away = environment.folder / "away"
     shutil.rmtree(away, ignore_errors=True)
-    shutil.copytree(
-        ROOT, away, ignore=shutil.ignore_patterns(".*", "__pycache__", "build", "bitymi_ns", "node_modules")
-    )
+    unwanted = ("bitymi_ns", ".*", "__pycache__", "build", "outputs", "demo", "node_modules")
+    shutil.copytree(ROOT, away, ignore=shutil.ignore_patterns(*unwanted))
     print(environment.run("python", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *TESTS, cwd=away))
-    try_commands(environment, data)
-    python = environment.run("python", "-c", "import platform; print(platform.python_version())").strip()
-    (FOUND / f"{name}.txt").write_text(f"# Python {python}: written by scripts/test_environment.py\n{found}", "utf8")
 
 
 def main() -> None:

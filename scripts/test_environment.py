@@ -53,7 +53,7 @@ class Environment:
     def versions(self) -> dict[str, str]:
         """Return the installed packages' versions by name, in lower case."""
         pairs = (line.split("==") for line in self.pip("list", "--format=freeze").splitlines())
-        return {name.lower().replace("_", "-"): version for name, version in sorted(pairs)}
+        return dict(sorted((name.lower().replace("_", "-"), version) for name, version in pairs))
 
 
 def interpreter_of(version: str) -> str:

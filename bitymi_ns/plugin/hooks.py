@@ -1,6 +1,5 @@
 """Change nerfstudio's functions and what they read, which no other module does: its registry and subclasses serve for
-the rest. Each function states what it changes, for which commands, what is lost without it, and what would make it
-superfluous."""
+the rest. Each function states what it changes, for which commands, what is lost without it, and what would end it."""
 
 import atexit
 import os
@@ -57,7 +56,7 @@ REMARKS = re.compile(
     r"|\[NOTE\] Not running eval iterations"  # the training curve is of held-out views
     r"|\[bold yellow\]Disabled comet|disabled local writer"
 )
-"""Beginnings of dropped lines. All others are shown: they may be about the capture."""
+"""Beginnings of dropped lines; others may be about the capture."""
 COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 EXPORTER, VIEWER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.viewer.run_viewer"
 LOOPBACK = "127.0.0.1"  # reachable from this machine alone, unlike nerfstudio's default 0.0.0.0
@@ -67,17 +66,15 @@ HOST_OPTION = "--viewer.websocket-host"
 def allow_numpy_scalars() -> None:
     """Let torch.load's safe mode read numpy's numbers.
 
-    Changes: torch's list of safe types, which it has since 2.4. For: commands that load a run. Without: checkpoints
-    whose schedulers left such numbers do not load with torch 2.6 or later. Superfluous once nerfstudio saves plain
-    numbers.
+    Changes: torch's list of safe types. For: commands that load a run. Without: checkpoints whose schedulers left such
+    numbers do not load with torch 2.6 or later. Superfluous once nerfstudio saves plain numbers.
     """
-    if not hasattr(torch.serialization, "add_safe_globals"):
-        return
     try:
         from numpy._core.multiarray import scalar
     except ImportError:  # numpy 1
         from numpy.core.multiarray import scalar
-    torch.serialization.add_safe_globals([scalar, np.dtype, type(np.dtype("float64")), type(np.dtype("float32"))])
+    if hasattr(torch.serialization, "add_safe_globals"):  # since 2.4
+        torch.serialization.add_safe_globals([scalar, np.dtype, type(np.dtype("float64")), type(np.dtype("float32"))])
 
 
 def read_names_of_callers() -> None:

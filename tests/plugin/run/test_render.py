@@ -131,10 +131,7 @@ def test_the_crop_of_a_camera_path_is_the_models(wall: Wall, camera_path: Any) -
     crop = {"crop_center": [1, 2, 3], "crop_scale": [2, 4, 6.0], "crop_rot": [0, 0, math.pi / 2]}
     camera_path({**path_of(1), "crop": {**crop, "crop_bg_color": {"r": 38, "g": 42, "b": 55}}})
     assert wall.crop_box is not None and (wall.crop_box.center, wall.crop_box.half) == ((1, 2, 3), (1, 2, 3))
-    assert wall.crop_box.contains(torch.tensor([[1 + 1.9, 2 + 0.9, 3], [1 + 0.9, 2 + 1.9, 3]])).tolist() == [
-        True,
-        False,
-    ]
+    assert wall.crop_box.contains(torch.tensor([[2.9, 2.9, 3], [1.9, 3.9, 3]])).tolist() == [True, False]
     camera_path(path_of(1))
     assert wall.crop_box is None
     for wrong in ({"crop_scale": [0, 1, 1]}, {"crop_center": [1, 2]}, {"crop_rot": ["a", 0, 0]}):
@@ -146,7 +143,7 @@ def decoded(path: Path) -> tuple[tuple[str, str, Fraction], list[np.ndarray]]:
     """Return codec, pixel format and frame rate, which PyAV 19 does not tell of a closed film, and the frames."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
-        stated = (stream.codec_context.name, stream.codec_context.pix_fmt, stream.average_rate)
+        stated = stream.codec_context.name, stream.codec_context.pix_fmt, stream.average_rate
         return stated, [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
 
 

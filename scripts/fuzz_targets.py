@@ -6,6 +6,7 @@ import copy
 import io
 import json
 import struct
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,15 +26,18 @@ from bitymi_ns.capture.types import CaptureError, ColmapCamera, MapFiles
 from bitymi_ns.measure.report.page import compose, to_page
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import ReportError
-from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.console import InputError, fail
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.run import checkpoints
 from bitymi_ns.plugin.run.camera_path import read_camera_path
+from bitymi_ns.plugin.run.checkpoint_reader import read_archive
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.ply import PlyError
+from bitymi_ns.safe_reading import reading
 from bitymi_ns.sample import generate
 from bitymi_ns.scene.config import SceneConfig
 from tests.captures import as_binary, colmap_model
+from tests.hostile import parts, saved
 from tests.measure.report.conftest import POSES, cell
 from tests.plugin.run.test_checkpoints import moved, state
 
@@ -271,13 +275,33 @@ def checkpoint(work: Path) -> Target:
         except Exception:  # cannot be stored, hence not read
             return
         loaded = checkpoints.load(path, SceneConfig())
-        for name, saved in loaded["optimizers"].items():
+        for name, moments in loaded["optimizers"].items():
             parameter = loaded["pipeline"][f"_model.scene.surfels.{name}"]
             optimizer = moved(parameter)
-            restore_optimizer(optimizer, Entry(saved, name))
+            restore_optimizer(optimizer, Entry(moments, name))
             optimizer.step()
 
     return Target(run, [bytes(range(k, k + 40)) for k in range(8)], (InputError, checkpoints.Misfit))
+
+
+def archive(work: Path) -> Target:
+    """Read files of torch.save, by their bytes; an input that is no archive becomes the pickle of one."""
+    path = checkpoints.path_of(work, 7)
+    layers = torch.nn.Linear(2, 3).state_dict()
+    whole = saved({"step": 7, "pipeline": layers, "optimizers": {"a": [(0.5, None, True, -(2**70))]}})
+    with zipfile.ZipFile(io.BytesIO(whole)) as file:
+        pickled = file.read("archive/data.pkl")
+
+    def run(data: bytes) -> None:
+        path.write_bytes(
+            data if data[:1] == b"P" else parts(lambda held, _: {**held, "data.pkl": data}.items())(whole, work)
+        )
+        with reading("it", fail), open(path, "rb") as file:
+            for values in read_archive(file)["pipeline"].values():
+                if isinstance(values, torch.Tensor):
+                    values.clone().sum()
+
+    return Target(run, [whole, pickled], (InputError,))
 
 
 TARGETS: dict[str, Callable[[Path], Target]] = {
@@ -290,4 +314,5 @@ TARGETS: dict[str, Callable[[Path], Target]] = {
     "camera-path": camera_path,
     "report": report,
     "checkpoint": checkpoint,
+    "archive": archive,
 }

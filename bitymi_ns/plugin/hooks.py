@@ -1,12 +1,9 @@
 """Change nerfstudio's functions and what they read, which no other module does: its registry and subclasses serve for
 the rest. Each function states what it changes, for which commands, what is lost without it, and what would end it."""
 
-import atexit
 import os
 import re
-import shutil
 import sys
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -152,13 +149,12 @@ def _given_config() -> Path | None:
 
 
 def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
-    """Find the folder of the checkpoints; for a bundle, make a stand-in that satisfies nerfstudio.
+    """Find the folder of the checkpoints, and read the one that nerfstudio is about to load.
 
     Changes: the answer of the trainer configuration's `get_checkpoint_dir`, for which eval_setup asks before it builds
     the pipeline; reads config.yml's path in eval_setup's frame, and options in the script's. For: ns-eval, ns-render,
-    ns-viewer, ns-export. Without: no bundle opens, nor a moved run or bundle or one used from another folder, and
-    commands that cannot work end in tracebacks. Superfluous once eval_setup passes on the path that it loads, and asks
-    the method for its state.
+    ns-viewer, ns-export. Without: no moved run or bundle opens, nor one used from another folder, and commands that
+    cannot work end in tracebacks. Superfluous once eval_setup passes on the path that it loads.
     """
     model, evaluated = config.pipeline.model, _folder_being_evaluated()
     if evaluated is not None:
@@ -175,7 +171,9 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
         if data is not None and not Path(data).exists() and has_cameras(model.bundle):  # its capture is gone
             datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data))
             datamanager.data = model.bundle
-        return _stub_checkpoint_dir(model.bundle)
+        if evaluated is not None:  # no pickled data may lie in a bundle
+            hand_over(config, model.bundle / MANIFEST, {"step": 0, "pipeline": {}})
+        return model.bundle
     folder = usual()
     if evaluated is not None:
         if (evaluated / config.relative_model_dir).is_dir():
@@ -183,10 +181,31 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
         # a resumed run records the step it went on from
         if config.load_step is None or not checkpoints.path_of(folder, config.load_step).is_file():
             config.load_step = checkpoints.newest_step(folder)
-        # nerfstudio's tools would report a bad checkpoint with a traceback
-        checkpoints.load(checkpoints.path_of(folder, config.load_step), model.scene)
+        path = checkpoints.path_of(folder, config.load_step)
+        hand_over(config, path, checkpoints.load(path, model.scene))
         config.take_poses_of(evaluated)
     return folder
+
+
+def hand_over(ours: Any, path: Path, state: dict[str, Any]) -> None:
+    """Have eval_setup load `state`, read from `path`, for the configuration `ours`.
+
+    Changes: `eval_load_checkpoint` in nerfstudio's eval_utils, once. For: ns-eval, ns-render, ns-viewer, ns-export.
+    Without: nerfstudio reads the file again by torch.load, which can run code of others, and no bundle opens.
+    Superfluous once eval_setup asks the method for its state.
+    """
+    from nerfstudio.utils import eval_utils
+
+    stock = eval_utils.eval_load_checkpoint
+
+    def load(config: Any, pipeline: Any) -> tuple[Path, int]:
+        if config is not ours:
+            return stock(config, pipeline)
+        eval_utils.eval_load_checkpoint = stock
+        pipeline.load_pipeline(state["pipeline"], state["step"])
+        return path, state["step"]
+
+    eval_utils.eval_load_checkpoint = load
 
 
 def _callers(depth: int = 1) -> list[FrameType]:
@@ -226,18 +245,6 @@ def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
             return folder.absolute()
     tried = ", ".join(str(folder) for folder in dict.fromkeys(candidates))
     fail(f"no bundle found ({MANIFEST} is not in {tried}). Keep config.yml in the bundle's folder.")
-
-
-def _stub_checkpoint_dir(bundle: Path) -> Path:
-    """Make a temporary folder with an empty checkpoint, as no pickled data may lie in a bundle. Its path has the name
-    of the bundle: by that path, in ns-eval's results, `bitymi report` recognises bundles."""
-    scratch = Path(tempfile.mkdtemp(prefix="bitymi-bundle-"))
-    atexit.register(shutil.rmtree, scratch, ignore_errors=True)
-    folder = scratch / bundle.name / "nerfstudio_models"
-    folder.mkdir(parents=True)
-    torch.save({"step": 0, **{name: {} for name in ("pipeline", "optimizers", "schedulers", "scalers")}},
-               folder / "step-000000000.ckpt")  # fmt: skip
-    return folder
 
 
 def refuse_others() -> None:

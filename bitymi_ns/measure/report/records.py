@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.trust import finite_numbers
 
 _BUNDLE = re.compile(r"(?<![a-z])(bundle|baked)(?![a-z])")
@@ -83,7 +84,8 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
     checkpoint = str(data.get("checkpoint") or "")
     name = str(data.get("method_name") or "unnamed method")
     # only the tail .../<folder>/<folder>/nerfstudio_models/step-*.ckpt: a data set's name must not match
-    tail = "/".join(Path(checkpoint.replace("\\", "/")).parts[-4:]).lower()
+    parts = Path(checkpoint.replace("\\", "/")).parts
+    tail = "/".join(parts[-2 if parts[-1:] == (MANIFEST,) else -4 :]).lower()
     baked = results.get("atlas_bytes", 0.0) > 0 or is_bundle_name(name) or is_bundle_name(tail)
     method = (_BUNDLE_SUFFIX.sub("", name) or name) if baked else name
     form = _FORMAT.search(tail) or _FORMAT.search(f"{source.parent.name}/{source.stem}".lower())

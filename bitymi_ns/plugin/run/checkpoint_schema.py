@@ -4,6 +4,7 @@ so nothing else uses an entry before."""
 from __future__ import annotations
 
 import math
+import reprlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NoReturn
@@ -107,7 +108,7 @@ def _kind(value: Any) -> str:
         laid_out = value.layout == torch.strided and value.device.type == "cpu"
         spread = "" if laid_out and value.is_contiguous() else ", not one after the other in memory"
         return f"{_name(value.dtype)} {list(value.shape)}{spread}"
-    return "nothing" if value is None else f"{type(value).__name__} {str(value)[:30]!r}"
+    return "nothing" if value is None else f"{type(value).__name__} {reprlib.repr(value)[:30]}"
 
 
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:

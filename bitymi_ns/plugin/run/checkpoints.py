@@ -1,8 +1,6 @@
 """Checkpoint files: write them whole or not at all, and read them with errors that say what to do."""
 
 import dataclasses
-import os
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +8,7 @@ import torch
 
 from bitymi_ns.files import complete_file, reason
 from bitymi_ns.plugin.console import fail, listed, warn
+from bitymi_ns.plugin.run.checkpoint_reader import read_archive
 from bitymi_ns.plugin.run.checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check
 from bitymi_ns.safe_reading import open_regular, reading
 from bitymi_ns.scene.config import SceneConfig
@@ -66,8 +65,10 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     way_out = f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
 
     advice = f"It is damaged (cut off or altered), or another program wrote it. {way_out}."
-    with reading(f"the checkpoint {path}", fail, advice):
-        state = _read(path)
+    with reading(f"the checkpoint {path}", fail, "Have it made readable for you (chmod u+r), or copy it."):
+        file = open_regular(path)
+    with file, reading(f"the checkpoint {path}", fail, advice):
+        state = read_archive(file)
     if not isinstance(state, dict) or not {"step", "pipeline", "optimizers"} <= state.keys():
         fail(f"{path} is not a nerfstudio checkpoint")
     try:
@@ -79,21 +80,6 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
         where = f"holds numbers that are not finite, or too large to be drawn, in {listed(broken)}"
         warn(f"The checkpoint {path} {where}: expect holes, or black.")
     return state
-
-
-def _read(path: Path) -> Any:
-    """Read an archive in torch's safe mode. Raises ValueError: its sizes or checksums are wrong."""
-    with open_regular(path) as file:
-        with zipfile.ZipFile(file) as archive:
-            parts = archive.infolist()
-            size = os.fstat(file.fileno()).st_size
-            if sum(part.file_size for part in parts) > size or any(part.compress_type for part in parts):
-                raise ValueError("its parts are compressed, or larger than the file")
-            altered = archive.testzip()  # torch ignores checksums
-        if altered is not None:
-            raise ValueError(f"the checksum of {altered} is wrong")
-        file.seek(0)
-        return torch.load(file, map_location="cpu", weights_only=True)
 
 
 def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:

@@ -26,51 +26,35 @@ if(BITYMI_EMULATED_CUDA)
   install(TARGETS _emulated LIBRARY DESTINATION bitymi_ns)
 endif()
 
-if(BITYMI_CUDA STREQUAL "OFF")
+include(cmake/find_cuda.cmake)
+find_cuda()
+if(why)
+  if(BITYMI_CUDA STREQUAL "ON")
+    message(FATAL_ERROR "BITYMI_CUDA=ON, but ${why}.")
+  endif()
+  message(STATUS "The package is built for the CPU alone: ${why}")
+elseif(note)
+  message(STATUS "CUDA: ${note}")
+endif()
+# pip hides the lines above: the package says why.
+file(CONFIGURE OUTPUT ${CMAKE_CURRENT_BINARY_DIR}/_cuda_build.py @ONLY CONTENT [[
+"""Why there are no CUDA kernels (empty: there are), and what this machine's cards lack. Written by CMake."""
+
+WHY_NOT = r"""@why@"""
+NOTE = r"""@note@"""
+]])
+install(FILES ${CMAKE_CURRENT_BINARY_DIR}/_cuda_build.py DESTINATION bitymi_ns)
+if(why)
   return()
 endif()
-include(CheckLanguage)
-check_language(CUDA)
-if(NOT CMAKE_CUDA_COMPILER)
-  if(BITYMI_CUDA STREQUAL "AUTO")
-    message(STATUS "No CUDA compiler: the package is built for the CPU alone")
-    return()
-  endif()
-  message(FATAL_ERROR "BITYMI_CUDA=ON, but no working nvcc was found. Install the CUDA toolkit (12 or 13), put its bin "
-    "folder on PATH or name it with -DCMAKE_CUDA_COMPILER=..., or build with BITYMI_CUDA=OFF.")
-endif()
 
-# Before the language is enabled: CMake would choose an architecture itself.
-if(NOT BITYMI_CUDA_ARCHITECTURES)
-  execute_process(COMMAND nvidia-smi --query-gpu=compute_cap --format=csv,noheader
-    OUTPUT_VARIABLE cards ERROR_QUIET OUTPUT_STRIP_TRAILING_WHITESPACE RESULT_VARIABLE no_card)
-  if(no_card EQUAL 0 AND cards MATCHES "^[0-9.\n]+$")
-    string(REPLACE "." "" cards "${cards}")
-    string(REPLACE "\n" ";" cards "${cards}")
-    list(REMOVE_DUPLICATES cards)
-    set(BITYMI_CUDA_ARCHITECTURES ${cards})
-  else()
-    execute_process(COMMAND ${CMAKE_CUDA_COMPILER} --list-gpu-arch OUTPUT_VARIABLE supported ERROR_QUIET)
-    foreach(arch 75 80 86 89 90 100 120)
-      if(supported MATCHES "compute_${arch}\n")
-        list(APPEND BITYMI_CUDA_ARCHITECTURES ${arch})
-      endif()
-    endforeach()
-  endif()
-endif()
-# Machine code for each; what later cards compile it from (PTX) for the newest alone.
+# Before the language is enabled: CMake would choose an architecture itself. Machine code for each; what later cards
+# compile it from (PTX) for the newest alone.
 set(CMAKE_CUDA_ARCHITECTURES ${BITYMI_CUDA_ARCHITECTURES})
 list(POP_BACK CMAKE_CUDA_ARCHITECTURES newest)
 list(TRANSFORM CMAKE_CUDA_ARCHITECTURES APPEND -real REGEX "^[0-9]+$")
 list(APPEND CMAKE_CUDA_ARCHITECTURES ${newest})
 enable_language(CUDA)
-if(CMAKE_CUDA_COMPILER_VERSION VERSION_LESS 12.0)
-  if(BITYMI_CUDA STREQUAL "ON")
-    message(FATAL_ERROR "CUDA ${CMAKE_CUDA_COMPILER_VERSION} is too old: the kernels need 12.0 or newer")
-  endif()
-  message(WARNING "CUDA ${CMAKE_CUDA_COMPILER_VERSION} is too old (12.0 is needed): built for the CPU alone")
-  return()
-endif()
 list(JOIN BITYMI_CUDA_ARCHITECTURES ", " architectures)
 message(STATUS "CUDA kernels for ${architectures} by nvcc ${CMAKE_CUDA_COMPILER_VERSION}")
 

@@ -22,13 +22,21 @@ def why_not_cuda(index: int | None = None) -> str | None:
             return f"torch {torch.__version__} is a build without CUDA"
         return "there is no NVIDIA GPU, or its driver is missing or too old for this torch"
     if importlib.util.find_spec("bitymi_ns._cuda") is None:
-        advice = "install the CUDA toolkit (12 or 13), put its bin folder on PATH and install bitymi-ns again"
-        return f"this installation has no CUDA kernels, because no nvcc was found when it was built: {advice}"
+        return f"this installation has no CUDA kernels: {built('WHY_NOT')}"
     try:
         kernels = importlib.import_module("bitymi_ns._cuda")
     except ImportError as error:
         return f"the CUDA kernels cannot be loaded: {error}"
     return _device_problem(kernels, torch.cuda.current_device() if index is None else index)
+
+
+def built(name: str) -> str:
+    """Return WHY_NOT or NOTE of `_cuda_build`, which cmake/cuda.cmake writes: why there are no CUDA kernels, and which
+    cards get less than they could."""
+    try:
+        return getattr(importlib.import_module("bitymi_ns._cuda_build"), name)
+    except ImportError:  # of an earlier version, installed in place
+        return "install bitymi-ns again" if name == "WHY_NOT" else ""
 
 
 @cache

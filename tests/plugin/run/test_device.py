@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Iterator
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
@@ -50,7 +50,10 @@ def test_why_a_card_is_not_used(card: ModuleType, monkeypatch: pytest.MonkeyPatc
     assert "cannot be loaded" in device.why_not_cuda()
     device._device_problem.cache_clear()
     monkeypatch.setattr(device.importlib.util, "find_spec", lambda name: None)
-    assert "nvcc" in device.why_not_cuda() and not device.has_cuda_kernels()
+    monkeypatch.setitem(sys.modules, "bitymi_ns._cuda_build", SimpleNamespace(WHY_NOT="nvcc 11.4 is too old"))
+    assert device.why_not_cuda() == "this installation has no CUDA kernels: nvcc 11.4 is too old"
+    monkeypatch.setitem(sys.modules, "bitymi_ns._cuda_build", None)
+    assert "install bitymi-ns again" in device.why_not_cuda() and not device.has_cuda_kernels()
 
 
 @pytest.fixture

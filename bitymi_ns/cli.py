@@ -328,6 +328,18 @@ class ViewBundle:
             server.server_close()
 
 
+@dataclass
+class Doctor:
+    """Describe this installation for a report of a problem, and try a training step on every device."""
+
+    def run(self) -> int:
+        from bitymi_ns.measure.doctor import examine
+
+        for name, line in examine():
+            say(f"{name:11} {line or 'ns-train bitymi cannot train here'}")
+        return 0 if line else 1
+
+
 Command = (
     Annotated[Sample, tyro.conf.subcommand(name="sample")]
     | Annotated[Sfm, tyro.conf.subcommand(name="sfm")]
@@ -338,6 +350,7 @@ Command = (
     | Annotated[Pack, tyro.conf.subcommand(name="pack")]
     | Annotated[Unpack, tyro.conf.subcommand(name="unpack")]
     | Annotated[Extras, tyro.conf.subcommand(name="extras")]
+    | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
     | Annotated[ViewBundle, tyro.conf.subcommand(name="view")]
 )
 

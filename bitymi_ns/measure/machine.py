@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 
-def _output(command: list[str], where: Path | None = None) -> str:
+def output(command: list[str], where: Path | None = None) -> str:
     """Run a command and return its standard output; empty if it fails."""
     try:
         result = subprocess.run(command, cwd=where, capture_output=True, text=True, check=False, timeout=30)
@@ -24,7 +24,7 @@ def commit() -> str:
     where = Path(__file__).resolve().parents[2]
     if not (where / ".git").exists():
         return ""
-    return _output(["git", "describe", "--always", "--dirty=+", "--exclude=*"], where)
+    return output(["git", "describe", "--always", "--dirty=+", "--exclude=*"], where)
 
 
 def cores() -> int:
@@ -36,7 +36,7 @@ def gpus() -> list[str]:
     """List the names of the NVIDIA GPUs, as the driver reports them."""
     if shutil.which("nvidia-smi") is None:
         return []
-    return _output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
+    return output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
 
 
 def versions() -> dict[str, str]:

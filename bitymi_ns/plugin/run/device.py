@@ -36,7 +36,7 @@ def built(name: str) -> str:
     try:
         return getattr(importlib.import_module("bitymi_ns._cuda_build"), name)
     except ImportError:  # of an earlier version, installed in place
-        return "install bitymi-ns again" if name == "WHY_NOT" else ""
+        return "it is of an earlier version, install bitymi-ns again" if name == "WHY_NOT" else ""
 
 
 @cache

@@ -297,9 +297,11 @@ def archive(work: Path) -> Target:
             data if data[:1] == b"P" else parts(lambda held, _: {**held, "data.pkl": data}.items())(whole, work)
         )
         with reading("it", fail), open(path, "rb") as file:
-            for values in read_archive(file)["pipeline"].values():
-                if isinstance(values, torch.Tensor):
-                    values.clone().sum()
+            state = read_archive(file)
+        layers = state.get("pipeline") if isinstance(state, dict) else None
+        for values in layers.values() if isinstance(layers, dict) else ():
+            if isinstance(values, torch.Tensor):
+                values.clone().sum()
 
     return Target(run, [whole, pickled], (InputError,))
 

@@ -12,9 +12,7 @@ from pathlib import Path
 from types import FrameType, SimpleNamespace, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
-import numpy as np
 import rich
-import torch
 from nerfstudio.configs import external_methods
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -58,20 +56,6 @@ COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 EXPORTER, VIEWER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.viewer.run_viewer"
 LOOPBACK = "127.0.0.1"  # reachable from this machine alone, unlike nerfstudio's default 0.0.0.0
 HOST_OPTION = "--viewer.websocket-host"
-
-
-def allow_numpy_scalars() -> None:
-    """Let torch.load's safe mode read numpy's numbers.
-
-    Changes: torch's list of safe types. For: commands that load a run. Without: checkpoints whose schedulers left such
-    numbers do not load with torch 2.6 or later. Superfluous once nerfstudio saves plain numbers.
-    """
-    try:
-        from numpy._core.multiarray import scalar
-    except ImportError:  # numpy 1
-        from numpy.core.multiarray import scalar
-    if hasattr(torch.serialization, "add_safe_globals"):  # since 2.4
-        torch.serialization.add_safe_globals([scalar, np.dtype, type(np.dtype("float64")), type(np.dtype("float32"))])
 
 
 def read_names_of_callers() -> None:

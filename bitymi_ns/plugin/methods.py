@@ -44,7 +44,6 @@ def _install() -> None:
         return
     CONSOLE.quiet = CONSOLE.quiet or not torchrun.own().first  # of several processes the first prints
     for change, lost in (
-        (hooks.allow_numpy_scalars, "checkpoints of nerfstudio's own methods may not load"),
         (hooks.read_names_of_callers, "commands start slowly"),
         (lambda: hooks.extend_exporter(_exports), "`ns-export bitymi-atlas` is not available"),
     ):

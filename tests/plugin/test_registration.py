@@ -111,10 +111,10 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
         importlib.reload(methods)
 
 
-CHANGES = ("allow_numpy_scalars", "read_names_of_callers", "extend_exporter", "refuse_without_config")
+CHANGES = ("read_names_of_callers", "extend_exporter", "refuse_without_config")
 
 
-@pytest.mark.parametrize("failing", CHANGES[:3])
+@pytest.mark.parametrize("failing", CHANGES[:2])
 def test_a_change_of_nerfstudio_that_fails_takes_no_other_with_it(
     monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
@@ -130,11 +130,6 @@ def test_a_change_of_nerfstudio_that_fails_takes_no_other_with_it(
     with pytest.warns(UserWarning, match="AttributeError: no such thing"):
         methods._install()
     assert made == list(CHANGES)
-
-
-def test_a_torch_without_a_list_of_safe_types_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(torch.serialization, "add_safe_globals", raising=False)
-    hooks.allow_numpy_scalars()
 
 
 OLD_MODULES = {

@@ -100,7 +100,7 @@ def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeyp
     for spoil, message in (
         (
             lambda: Image.new("L", (36, 48)).save(mask),
-            "frame_00004.png is turned .* it has 36 x 48 pixels.*--use-masks False",
+            "04.png is turned .* it has 36 x 48 pixels.*--use-masks False",
         ),
         (lambda: mask.write_text("x"), "the mask .*frame_00004.png cannot be read"),
         (mask.unlink, r"1 of 12 masks .* are missing: .*frame_00004.png. Put them there, .*--use-masks False"),

@@ -270,7 +270,8 @@ def bundle(
     megabytes: float | None,
 ) -> dict[str, float]:
     """Bake a bundle and compare it with the held-out photographs."""
-    name, device = f"{'-'.join(shlex.split(run.row))}-{run.steps}-{run.seed}", torch.device(run.device)
+    name = "-".join((Path(run.data).stem, *shlex.split(run.row), f"{run.steps}-{run.seed}"))
+    device = torch.device(run.device)
     with tempfile.TemporaryDirectory() as folder:
         path = (run.keep or Path(folder)) / (name if megabytes is None else f"{name}-{megabytes:g}MB")
         start = time.perf_counter()

@@ -81,7 +81,7 @@ def expected() -> set[str]:
     files = {line.replace("method_configs/", "bitymi_ns/method_configs/") for line in listed.stdout.splitlines()}
     modules = ("_cpu", "_cpu_x86_64_v4") if platform.machine() == "x86_64" else ("_cpu",)
     compiled = {f"bitymi_ns/{name}{sysconfig.get_config_var('EXT_SUFFIX')}" for name in modules}
-    return files | compiled | {"bitymi_ns/_cpu_features.py"}
+    return files | compiled | {"bitymi_ns/_cpu_features.py", "bitymi_ns/_cuda_build.py"}
 
 
 def check_contents(wheel: Path) -> None:

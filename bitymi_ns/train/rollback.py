@@ -128,9 +128,11 @@ class RollbackGuard:
             self._limit = max(self._loss_of(views, 1.0), self._loss_of(views, 1.0, blank=True))
         self._states = [(step, self._capture())]
 
-    def restart(self) -> None:
-        """Discard captured states and start a new window, when the scene's texture becomes texels."""
+    def restart(self, forget: bool = False) -> None:
+        """Discard captured states and start a new window, when the scene's texture becomes texels; with `forget` also
+        the loss of the best window."""
         self._states = []
+        self._best = math.inf if forget else self._best
         self._sum, self._count = torch.zeros_like(self._sum), 0
 
     @torch.no_grad()

@@ -41,26 +41,38 @@ class Schedule:
         self.config = config
         self.max_steps = max_steps
         self.extent = float(extent)
-        densify = config.densify
         check_ranges(config)
+        self._texels, self._pixels = texels, pixels
+        self.plan()
+
+    def plan(self, begun: int | None = None) -> None:
+        """Plan the events of the run.
+
+        Args:
+            begun: step at which the texels of a resumed run began, whatever its length was: since then pictures have
+                full size and no surfel may be added; None: it has none.
+        """
+        config, densify = self.config, self.config.densify
         # short runs skip events to keep the minimum interval
         reset = densify.reset_interval * self._stride(densify.reset_interval, densify.min_reset_interval)
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)
-        self.texels_start = min(max_steps, self.scaled(config.texels.start)) if texels else max_steps
-        stop = min(densify.stop, config.texels.start) if texels else densify.stop
+        start = self.scaled(config.texels.start) if begun is None else begun
+        self.texels_start = min(self.max_steps, start) if self._texels else self.max_steps
+        stop = min(densify.stop, config.texels.start) if self._texels else densify.stop
         # steps after which surfels are densified and pruned, opacities reset, and the error and final prunes run
-        self.densify_steps = self._events(_multiples(interval, densify.start, stop))
-        self.reset_steps = self._events(_multiples(reset, 0, stop))
+        before = self.texels_start - 1
+        self.densify_steps = self._events(_multiples(interval, densify.start, stop), before)
+        self.reset_steps = self._events(_multiples(reset, 0, stop), before)
         self.reset_every = self.scaled(reset)
         prunes = densify.prune_error > 0 and 0 < stop < REFERENCE_STEPS
-        self.error_prune_steps = self._events([stop] if prunes else [])
+        self.error_prune_steps = self._events([stop] if prunes else [], self.texels_start)
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
-        self._doublings = self._image_doublings(pixels)
+        self._doublings = [] if begun is not None else self._image_doublings(self._pixels)
         self._last_part: Schedule | None = None
-        if self.texels_start < max_steps:
+        if self.texels_start < self.max_steps:
             slower = config.lr.times(config.texels.surfel_rates)
             slower.mean_pixels = config.lr.times(config.texels.mean_rates).mean_pixels
-            self._last_part = Schedule(replace(config, lr=slower), self.texel_steps, extent)
+            self._last_part = Schedule(replace(config, lr=slower), self.texel_steps, self.extent)
 
     @property
     def in_pixels(self) -> bool:
@@ -91,8 +103,10 @@ class Schedule:
     def _stride(self, interval: int, least: int) -> int:
         return max(1, round(least * REFERENCE_STEPS / (interval * self.max_steps)))
 
-    def _events(self, steps_at_30k: list[int]) -> frozenset[int]:
-        return frozenset(min(self.scaled(s), self.max_steps - 1) for s in steps_at_30k)
+    def _events(self, steps_at_30k: list[int], last: int | None = None) -> frozenset[int]:
+        last = self.max_steps if last is None else last
+        steps = (min(self.scaled(s), self.max_steps - 1) for s in steps_at_30k)
+        return frozenset(step for step in steps if step <= last)
 
     def reset_opacity(self) -> float:
         """Compute the opacity after a reset: `reset_opacity`, or more in short runs.

@@ -15,6 +15,7 @@ from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
 from bitymi_ns.ops.picture_cuda import PhotographTarget
+from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
@@ -274,13 +275,23 @@ class Training:
             "poses": self.poses.state_dict(),
             "seconds": self.clock.seconds,
             "cpu_seconds": self.clock.cpu_seconds,
+            "max_steps": self.schedule.max_steps,
+            "texels_start": self.schedule.texels_start if isinstance(self.scene.field, TexelField) else None,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
+        """Restore what `state_dict` returned, also of a run of another length; call it once the scene is restored."""
+        schedule = self.schedule
+        length = state.get("max_steps") or schedule.max_steps  # checkpoints of earlier versions have fewer entries
+        if isinstance(self.scene.field, TexelField):
+            begun = state.get("texels_start")
+            earlier = Schedule(schedule.config, length, texels=True).texels_start
+            schedule.plan(earlier if begun is None else int(begun))
         self.strategy.load_state_dict(state["strategy"])
-        if "guard" in state:  # checkpoints of earlier versions have none
+        if "guard" in state:
             self.guard.load_state_dict(state["guard"])
+            if length != schedule.max_steps:
+                self.guard.restart(forget=True)  # losses at the resolution and rates of another schedule
         device = self.scene.surfels["means"].device  # a checkpoint is read on the CPU
         self.exposure.load_state_dict(state.get("exposure"), len(self._full_size), device)
         self.poses.load_state_dict(state.get("poses"))

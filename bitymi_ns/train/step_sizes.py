@@ -92,4 +92,5 @@ class StepSizes:
 
     def load_state_dict(self, state: Mapping[str, Any], device: torch.device) -> None:
         """Restore what `state_dict` returned."""
-        self._set(state["footprints"].to(device))
+        if self.schedule.in_pixels:
+            self._set(state["footprints"].to(device))

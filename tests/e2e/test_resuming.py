@@ -19,6 +19,7 @@ from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.trainer import BitymiTrainer
 from bitymi_ns.train.schedules import Schedule
+from bitymi_ns.train.step import Training
 from tests.captures import edit
 from tests.e2e.runs import Start, a_run_of, checkpoint, different
 
@@ -37,6 +38,32 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
     assert different(checkpoint(trained, 59), checkpoint(config, 59)) == []
     steps = [json.loads(line)["step"] for line in (config.get_base_dir() / FILE).read_text().splitlines()]
     assert steps == [20, 40, 60]  # the first point is that of the interrupted run
+
+
+def test_a_finished_run_can_be_made_longer_or_an_interrupted_one_shorter(
+    trained: BitymiTrainerConfig, start: Start
+) -> None:
+    for number, (step, length) in enumerate([(59, 150), (40, 45)]):
+        config = start(name=f"length{number}")
+        config.load_dir, config.load_step, config.max_num_iterations = trained.get_checkpoint_dir(), step, length
+        config.steps_per_save = 7
+        state = checkpoint(trained, step)  # of an earlier version: without the step at which texels began
+        if number:
+            del state["pipeline"]["_model._extra_state"]["run"]["texels_start"]
+            config.load_dir, config.load_step = config.get_base_dir().parent / "earlier", None
+            config.load_dir.mkdir(parents=True)
+            torch.save(state, config.load_dir / f"step-{step:09d}.ckpt")
+        ns_train.main(config)
+        assert checkpoint(config, length - 1)["pipeline"]["_model._extra_state"]["run"]["texels_start"] == 36
+
+
+def test_only_divergence_is_called_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(self: Any, view: Any) -> None:
+        raise ValueError("Trace.run: first has 951 elements, expected 1179")
+
+    monkeypatch.setattr(Training, "losses", wrong)
+    with pytest.raises(ValueError, match="expected 1179"):
+        ns_train.main(start(name="wrong"))
 
 
 def test_a_finished_run_is_not_touched_when_it_is_resumed(trained: BitymiTrainerConfig, start: Start) -> None:

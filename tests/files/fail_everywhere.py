@@ -207,7 +207,7 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
 
     def checkpoint(place: Path, version: int) -> None:
         path = place / "models" / "step-000000009.ckpt"
-        checkpoints.save({**state, "step": version}, path, scratch=place)
+        checkpoints.save({**state, "step": 9 + version}, path, place, config.pipeline.model.scene)
 
     (work / "curve").write_text("".join(json.dumps({"step": step}) + "\n" for step in range(10)))
 

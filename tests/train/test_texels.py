@@ -208,6 +208,31 @@ def test_a_run_resumes_before_and_after_its_texels_came(textured, views) -> None
         assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
 
 
+@pytest.mark.parametrize("length", [45, 97, 400])
+def test_a_run_of_another_length_goes_on_at_every_event(textured, views, length: int) -> None:
+    """Events of 60 steps: densifications until 29, resets, texels from 36, final prunes until 54, poses until 54."""
+    options = config(exposure="gain", refine_poses="on")
+    first, states = Trainer(textured(), views, options, 60), []
+    for step in range(60):
+        first.advance()
+        if step in (1, 28, 35, 36, 59) and first.step < length:
+            states.append(state_of(first))
+    for state in states:
+        resumed = Trainer(textured(every=5), views, options, length)
+        resume(resumed, state)
+        schedule, had_texels = resumed.training.schedule, state["step"] > 36
+        assert not had_texels or (schedule.texels_start, schedule.resolution_factor(resumed.step)) == (36, 1.0)
+        known = {*schedule.densify_steps, *schedule.reset_steps, *schedule.error_prune_steps, length - 1}
+        events = {*known, *schedule.final_prune_steps, schedule.texels_start}
+        for event in sorted(event for event in events if event >= resumed.step):
+            resumed.step = event  # other steps change no shapes
+            *_, report = resumed.advance()
+            assert not (had_texels and {"cloned", "opacity_reset"} & report.keys())
+        field = resumed.scene.field
+        assert isinstance(field, TexelField) and len(field.size) == len(resumed.scene)
+        assert int(field.size.long().prod(1).sum()) == len(field.texels)
+
+
 def test_surfels_that_are_pruned_take_their_texels_along(textured, views) -> None:
     scene = textured()
     trainer = Trainer(scene, views, config(), 60)

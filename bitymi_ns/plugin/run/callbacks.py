@@ -25,6 +25,7 @@ from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.visibility import views_without_surfels
 from bitymi_ns.train import messages
+from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
@@ -58,7 +59,7 @@ class TrainingRun:
         self.capture = capture_fingerprint(dataset)
         self._random_state: Tensor | None = None
         if resume_state := model.resume_state:
-            self.training.load_state_dict(resume_state)
+            self.training.load_state_dict({"max_steps": model.trained_for, **resume_state})
             self._random_state = resume_state["random"]
             if "capture" in resume_state:  # checkpoints of earlier versions have none
                 warn_of_other_capture(resume_state["capture"], self.capture)
@@ -131,7 +132,7 @@ class TrainingRun:
         """Compare a render of the step's view with its photograph."""
         try:
             return self.training.losses(view)[0]
-        except ValueError as error:
+        except TrainingDiverged as error:
             self._diverged(error)
 
     def after(self, step: int) -> None:
@@ -140,7 +141,7 @@ class TrainingRun:
             if step in self.curve_steps:
                 self.training.watch.finish(self.scene)
             report = self.training.finish()
-        except ValueError as error:
+        except TrainingDiverged as error:
             self._diverged(error)
         if report.get("held_back") and not self._held_back:
             self._held_back = True
@@ -151,7 +152,7 @@ class TrainingRun:
         if step in self.curve_steps:
             self._add_point(step)
 
-    def _diverged(self, error: ValueError) -> NoReturn:
+    def _diverged(self, error: TrainingDiverged) -> NoReturn:
         fail(
             f"training cannot go on at step {self.training.step}: {error}. Earlier checkpoints are kept; lower "
             "learning rates (--pipeline.model.train.lr.*) may help.",

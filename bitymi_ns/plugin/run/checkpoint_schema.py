@@ -26,6 +26,8 @@ EXTRA_STATE = "_extra_state"  # torch's name of a module's state beside tensors
 SCENE = "_model.scene."  # prefix of the scene's parameters
 SURFELS = f"{SCENE}surfels."
 LARGEST = 1e15  # absolute value of a drawable parameter: its square, and sums of squares, are finite in float32
+_FIELD_GROUPS = {"field_table": ("field.field_table",), "field_mlp": tuple(f"field.field_w{i}" for i in (1, 2, 3))}
+"""Parameters of the optimisers that are not of one surfel parameter, whose name they have."""
 _GEOMETRY = dict(zip(GEOMETRY, ((3,), (4,), (2,), (), ()), strict=True))
 
 
@@ -85,10 +87,10 @@ class Entry:
         return int(self.number(low, MOST))
 
     def tensor(self, *shape: int | None, dtype: torch.dtype | None = torch.float32) -> Tensor:
-        """Return a contiguous CPU tensor of this shape, None = any size; with dtype None, of any shape and dtype. A
-        file's strides may reach beyond its numbers."""
+        """Return a contiguous tensor of this shape, None = any size; with dtype None, of any shape and dtype. A file's
+        strides may reach beyond its numbers, or it may hold none of them (device meta)."""
         value = self.value
-        plain = type(value) in (Tensor, Parameter) and value.layout == torch.strided and value.device.type == "cpu"
+        plain = type(value) in (Tensor, Parameter) and value.layout == torch.strided and not value.is_meta
         fits = plain and dtype in (None, value.dtype) and value.is_contiguous()
         if fits and dtype is not None:
             fits = len(shape) == value.ndim and all(a in (None, b) for a, b in zip(shape, value.shape, strict=True))
@@ -105,18 +107,40 @@ def _name(dtype: torch.dtype) -> str:
 def _kind(value: Any) -> str:
     """Describe a value for a message."""
     if isinstance(value, Tensor):
-        laid_out = value.layout == torch.strided and value.device.type == "cpu"
+        laid_out = value.layout == torch.strided and not value.is_meta
         spread = "" if laid_out and value.is_contiguous() else ", not one after the other in memory"
         return f"{_name(value.dtype)} {list(value.shape)}{spread}"
     return "nothing" if value is None else f"{type(value).__name__} {reprlib.repr(value)[:30]}"
 
 
+def check_unwritten(state: Mapping[str, Any], scene: SceneConfig) -> None:
+    """Check a checkpoint before it is written, on any device and without a copy: all entries, and the optimisers'
+    states against their parameters. Raises Misfit: an entry is missing or wrong."""
+    parameters = check_entries(state, scene)
+    for optimizer in Entry(state["optimizers"], "optimizers").parts():
+        group = optimizer.name.removeprefix("optimizers.")
+        names = _FIELD_GROUPS.get(group, (f"surfels.{group}",))
+        check_optimizer(optimizer, [Entry(parameters, SCENE)[SCENE + name].value for name in names])
+
+
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
+    """Check all entries of a checkpoint, and return the names of parameters with numbers that are not finite, or too
+    large to be drawn. Raises Misfit: an entry is missing or wrong."""
+    drawable = {
+        name.removeprefix("_model."): (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
+        for name, values in check_entries(state, scene).items()
+    }
+    broken = [name for name, rows in drawable.items() if not bool(rows.all())]
+    if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in _GEOMETRY]).all(0).any()):
+        raise Misfit(f"{broken[0]} holds numbers that are too large, or none, for every surfel")
+    return broken
+
+
+def check_entries(state: Mapping[str, Any], scene: SceneConfig) -> dict[str, Tensor]:
     """Check all entries of a checkpoint against the configuration of its scene; those that other versions lack may be
-    missing. Return the names of parameters with numbers that are not finite, or too large to be drawn. Raises Misfit:
-    an entry is missing or wrong."""
+    missing. Return the scene's parameters by name. Raises Misfit: an entry is missing or wrong."""
     root = Entry(dict(state))
-    root["step"].count()
+    step = root["step"].count()
     pipeline = root["pipeline"]
     parameters = _parameters(pipeline, scene)
     rows = len(pipeline[f"{SURFELS}means"].value)
@@ -135,18 +159,11 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
         except ValueError as error:
             raise Misfit(f"{options.name} has to be a table of options as JSON") from error
     if (run := extra.get("run")) is not None and run.table():
-        _check_run(run, rows)
+        _check_run(run, rows, step)
     for entry in (root["optimizers"], root.get("schedulers"), root.get("scalers")):
         if entry is not None:
             entry.table()
-    drawable = {
-        name.removeprefix("_model."): (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
-        for name, values in parameters.items()
-    }
-    broken = [name for name, rows in drawable.items() if not bool(rows.all())]
-    if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in _GEOMETRY]).all(0).any()):
-        raise Misfit(f"{broken[0]} holds numbers that are too large, or none, for every surfel")
-    return broken
+    return parameters
 
 
 def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
@@ -224,8 +241,13 @@ def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
     optimizer.load_state_dict({"state": saved.value["state"], "param_groups": groups})
 
 
-def _check_run(run: Entry, rows: int) -> None:
+def _check_run(run: Entry, rows: int, step: int) -> None:
     """Check a run's state beside parameters and optimisers."""
+    if (length := run.get("max_steps")) is not None:
+        length.count(1)
+    if (start := run.get("texels_start")) is not None:
+        start.number(0, step)
+        start.count()
     strategy = run["strategy"]
     first = strategy[STATISTICS[0]].tensor(None)
     if len(first) not in (0, rows):

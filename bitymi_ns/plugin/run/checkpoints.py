@@ -9,7 +9,7 @@ import torch
 from bitymi_ns.files import complete_file, reason
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.plugin.run.checkpoint_reader import read_archive
-from bitymi_ns.plugin.run.checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check
+from bitymi_ns.plugin.run.checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check, check_unwritten
 from bitymi_ns.safe_reading import open_regular, reading
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.trust import json_of
@@ -19,19 +19,26 @@ MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragm
 """Scene options that may differ from a checkpoint's: they change only how parameters are drawn or learned."""
 
 
-def save(state: dict[str, Any], path: Path, scratch: Path) -> None:
-    """Write a checkpoint; a crash or a full disk leaves the previous ones as they were. The unfinished file lies in
-    `scratch`, a folder on the same file system: nerfstudio takes any file beside the checkpoints for one."""
+def save(state: dict[str, Any], path: Path, scratch: Path, scene: SceneConfig) -> None:
+    """Write a checkpoint that `load` takes; a crash, a full disk or a wrong state leaves the previous ones as they
+    were. The unfinished file lies in `scratch`, a folder on the same file system: nerfstudio takes any file beside the
+    checkpoints for one."""
     try:
+        check_unwritten(state, scene)
         with complete_file(path, scratch) as file:
             torch.save(state, file)
-    except (OSError, RuntimeError) as error:
+    except (OSError, RuntimeError, Misfit) as error:
         # after a failed write torch still ends its archive, and reports that: the disk's error is in its context
         behind: BaseException | None = error
         while behind is not None and not isinstance(behind, OSError):
             behind = behind.__context__
         kept = sorted(p.name for p in path.parent.glob("*.ckpt"))
-        detail = reason(behind or OSError(0, "the disk took only a part of it"), path)
+        if isinstance(error, Misfit):
+            detail = f"nothing could read it ({error}), which is a fault of bitymi-ns: please report it"
+        elif behind is not None or "inline_container" in str(error):
+            detail = reason(behind or OSError(0, "the disk took only a part of it"), path)
+        else:
+            raise
         then = f"Resume with --load-dir {path.parent} (from {kept[-1]}, which is intact)" if kept else "Train again"
         fail(f"the checkpoint {path} could not be written: {detail}.\n  {then}.", error)
 

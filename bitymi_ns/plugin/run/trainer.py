@@ -203,7 +203,7 @@ class BitymiTrainer(Trainer):
             "schedulers": {name: s.state_dict() for name, s in self.optimizers.schedulers.items()},
             "scalers": self.grad_scaler.state_dict(),
         }
-        checkpoints.save(state, path, scratch=self.base_dir)
+        checkpoints.save(state, path, self.base_dir, self.config.pipeline.model.scene)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("step-*.ckpt"):
                 if other.name < path.name:  # later ones are of a run that this one branched from

@@ -148,7 +148,7 @@ def test_a_full_disk(
         saved.unlink()
     then = "Resume with --load-dir .*intact" if earlier else "Train again"
     with pytest.raises(InputError, match=f"(?s)could not be written: .*{detail}.*{then}"):
-        checkpoints.save({}, checkpoints.path_of(saved.parent, 9), scratch=saved.parent)
+        checkpoints.save(state(SceneConfig()), checkpoints.path_of(saved.parent, 9), saved.parent, SceneConfig())
     assert [p.name for p in saved.parent.iterdir()] == ([saved.name] if earlier else [])
     assert not earlier or saved.read_bytes() == whole
 
@@ -251,6 +251,24 @@ def test_every_entry_is_checked_by_kind_shape_and_type(saved: Path, keys: Any, v
     at(*keys)(whole, value)
     torch.save(whole, saved)
     refused(saved, message)
+
+
+UNWRITTEN = [
+    *((keys, value, message) for keys, value, message in WRONG if isinstance(value, torch.Tensor) and keys[1] != MEANS),
+    (("pipeline", MEANS), torch.ones(6, 3), r"quats has to be float32 \[6, 4\], not float32 \[5, 4\]"),
+    (("pipeline", MEANS), torch.ones(5, 3, device="meta"), "means has to be float32"),
+    (("optimizers", "quats", "state", 0, "exp_avg"), torch.ones(6, 4), r"quats.*exp_avg has to be float32 \[5, 4"),
+    ((*RUN, "texels_start"), 8, "run.texels_start has to be from 0 to 7, not 8"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("keys", "value", "message"), UNWRITTEN, ids=lambda value: str(value)[:40])
+def test_what_nothing_could_read_is_not_written(saved: Path, keys: Any, value: Any, message: str) -> None:
+    whole, before = state(SceneConfig()), saved.read_bytes()
+    at(*keys)(whole, value)
+    with pytest.raises(InputError, match=f"(?s)could not be written.*{message}.*from {saved.name}, which is intact"):
+        checkpoints.save(whole, checkpoints.path_of(saved.parent, 9), saved.parent, SceneConfig())
+    assert [path.read_bytes() for path in saved.parent.iterdir()] == [before]
 
 
 def test_texels_have_to_fit_their_tiles(saved: Path) -> None:

@@ -22,7 +22,18 @@ from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.read import CaptureOptions, read_capture
 from bitymi_ns.capture.types import OPENCV_AXES, Photograph
-from bitymi_ns.ops import blended_image, can_rasterize, project, rasterize_image, trace
+from bitymi_ns.ops import (
+    Fragments,
+    Projection,
+    TooManyFragments,
+    blended_image,
+    can_rasterize,
+    draw_in_bands,
+    project,
+    rasterize_image,
+    trace,
+)
+from bitymi_ns.ops.backend import on_same_device
 from bitymi_ns.ops.constants import BETA_MAX, COLOR_BIAS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
@@ -119,28 +130,40 @@ def rasterize(
     Raises:
         ValueError: a shape, dtype or device does not fit, a scale, opacity or beta is out of its range, or the camera
             has skew.
-        TooManyFragments: the view's fragments do not fit into memory.
+        TooManyFragments: those of a single row of screen tiles do not fit into memory; a larger view is drawn in bands.
     """
-    _check_range("scales", scales, torch.finfo(scales.dtype).tiny, torch.finfo(scales.dtype).max)
-    _check_range("opacities", opacities, 0.0, 1.0)
-    _check_range("betas", betas, 0.0, BETA_MAX)
+    on_same_device(means, scales=scales, opacities=opacities, betas=betas)
+    _check_ranges(
+        scales=(scales, torch.finfo(scales.dtype).tiny, torch.finfo(scales.dtype).max),
+        opacities=(opacities, 0.0, 1.0),
+        betas=(betas, 0.0, BETA_MAX),
+    )
     geometry = (means, quats, scales.log(), _logit(opacities), _logit(betas / BETA_MAX))
     projection = project(*geometry, camera, near)
     base = colors - COLOR_BIAS
     if not maps and can_rasterize(means.device):
         image, marks = rasterize_image(projection, base)
         return RenderOutput.of_image(image, projection, marks, background, maps)
-    fragments = trace(projection)
-    image = blended_image(fragments, projection, base, maps=maps)
+
+    def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
+        fragments = trace(part, most=most)
+        return blended_image(fragments, part, base, maps=maps), fragments
+
+    try:
+        image, fragments = draw(projection, 0)
+    except TooManyFragments as error:
+        image, fragments = draw_in_bands(projection, draw, error)
     return RenderOutput.of_image(image, projection, fragments, background, maps)
 
 
-def _check_range(name: str, values: Tensor, low: float, high: float) -> None:
-    wrong = ~((values >= low) & (values <= high))
-    if bool(wrong.any()):
-        row = tuple(wrong.nonzero()[0].tolist())
-        limits = "above 0 and finite" if 0.0 < low else f"from {low:g} to {high:g}"
-        raise ValueError(f"{name} have to be {limits}: {name}{list(row)} is {values[row].item():g}")
+def _check_ranges(**ranges: tuple[Tensor, float, float]) -> None:
+    wrong = {name: ~((values >= low) & (values <= high)) for name, (values, low, high) in ranges.items()}
+    if not torch.stack([each.any() for each in wrong.values()]).any():  # waits for the device once
+        return
+    name = next(name for name, each in wrong.items() if each.any())
+    (values, low, high), row = ranges[name], tuple(wrong[name].nonzero()[0].tolist())
+    limits = "above 0 and finite" if 0.0 < low else f"from {low:g} to {high:g}"
+    raise ValueError(f"{name} have to be {limits}: {name}{list(row)} is {values[row].item():g}")
 
 
 def _logit(share: Tensor) -> Tensor:

@@ -375,7 +375,7 @@ def _run(args: Sequence[str] | None) -> int:
     except BrokenPipeError:
         raise
     except (ValueError, OSError, KernelsUnavailable) as error:
-        say(f"bitymi: {error}", sys.stderr)
+        say(f"bitymi: {exit_messages.line_of(error) or error}", sys.stderr)
         return 1
 
 

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, NoReturn, TextIO
 
 from rich.filesize import decimal
 
+from bitymi_ns.exit_messages import out_of_memory
 from bitymi_ns.trust import json_of
 
 MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs need a tenth of it
@@ -97,7 +98,7 @@ def why(error: BaseException) -> str:
         return f"it is no text in {error.encoding.upper()} (byte {error.start})"
     if isinstance(error, KeyError):
         return f"the entry {error} is missing"
-    if isinstance(error, MemoryError):
+    if out_of_memory(error):
         return "it declares more than memory holds"
     if isinstance(error, RecursionError):
         return "it is nested too deeply"

@@ -118,6 +118,7 @@ def main() -> None:
         python = install(wheel, folder / "venv")
         away = folder / "away"
         shutil.copytree(ROOT / "tests", away / "tests", ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copytree(ROOT / "web" / "test", away / "web" / "test")
         shutil.copy(ROOT / "pyproject.toml", away)
         run(python, "-c", WHERE, cwd=away)
         options = ("-q", "-p", "no:cacheprovider", "--disable-warnings")

@@ -22,6 +22,7 @@ from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bake.early_stopping import EarlyStopping
 from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.manifest import dump
+from bitymi_ns.ops import trace_cpu
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.reference.project import Projection
 from bitymi_ns.ops.reference.project import project as reference_project
@@ -65,7 +66,12 @@ def camera_of(width: int = 24, height: int = 18) -> bitymi_ns.Camera:
     return bitymi_ns.Camera(torch.eye(4), K, width, height)
 
 
-def test_rasterize_gives_values_and_gradients_of_the_float64_reference() -> None:
+@pytest.mark.parametrize("most", [trace_cpu.MOST, 600])
+def test_rasterize_gives_values_and_gradients_of_the_float64_reference(
+    most: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also in bands, where memory holds few fragments."""
+    monkeypatch.setattr(trace_cpu, "MOST", most)
     values, camera, background = surfels(), camera_of(), torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
     drawn = bitymi_ns.rasterize(**values, camera=camera, background=background, maps=True)
     twin = surfels()

@@ -47,19 +47,23 @@ def test_ctrl_c_in_the_first_second(after: float) -> None:
         os.kill(process.pid, signal.SIGINT)
         _, said = process.communicate()
     assert process.returncode == 130
-    assert said == "bitymi: interrupted; nothing was left half-written\n"
+    assert said == "bitymi: interrupted\n"
 
 
 @pytest.mark.parametrize(
     ("error", "line"),
     [
-        ("KeyboardInterrupt", "bitymi: interrupted; nothing was left half-written\n"),
+        ("KeyboardInterrupt", "bitymi: interrupted\n"),
         ("OSError(28, 'No space', 'a.png')", "bitymi: a.png cannot be written: the disk is full: free some space"),
         ("OSError(28, 'No space')", "bitymi: a result cannot be written: the disk is full"),
         ("OSError(30, 'Read-only', 'a')", "bitymi: a cannot be written: the file system is read-only"),
         ("OSError(5, 'I/O error', 'a')", "bitymi: a cannot be read or written: the disk reports an error of its own"),
         ("OSError(24, 'Too many', 'a')", "bitymi: a cannot be read or written: too many files are open: allow more"),
         ("MemoryError()", "bitymi: there is not enough memory for this"),
+        ("RuntimeError('[enforce] DefaultCPUAllocator: not enough memory')", "bitymi: there is not enough memory"),
+        ("RuntimeError('CUDA out of memory. Tried to allocate 2 GiB')", "bitymi: there is not enough memory"),
+        ("OSError(13, 'Permission denied', 'a')", "bitymi: a cannot be read or written: you have no permission for"),
+        ("OSError(2, 'No such file', 'a')", "bitymi: a cannot be read or written: it does not exist: check the path"),
     ],
 )
 def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
@@ -74,8 +78,23 @@ def test_faults_of_the_program_keep_their_traceback() -> None:
     code = "from bitymi_ns import exit_messages; exit_messages.install(); raise ZeroDivisionError"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert "Traceback" in done.stderr and done.returncode == 1
-    with pytest.raises(FileNotFoundError):
-        exit_messages.run(lambda: len(Path("/nowhere").read_bytes()))
+    with pytest.raises(KeyError):
+        exit_messages.run(lambda: {}["missing"])
+
+
+def test_work_goes_on_when_nobody_reads_its_output(tmp_path: Path) -> None:
+    code = (
+        "import sys; from bitymi_ns import exit_messages; exit_messages.outlive_output(); sys.stdin.read()\n"
+        "for _ in range(100): print('x' * 1000, flush=True)\n"
+        f"open({str(tmp_path / 'done')!r}, 'w').close()"
+    )
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", code], stdin=pipe, stdout=pipe, stderr=pipe) as process:
+        assert process.stdin is not None and process.stdout is not None and process.stderr is not None
+        process.stdout.close()  # like `| head`
+        process.stdin.close()
+        assert process.stderr.read() == b""
+    assert process.returncode == 0 and (tmp_path / "done").exists()
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")

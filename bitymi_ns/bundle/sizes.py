@@ -10,6 +10,7 @@ import psutil
 from bitymi_ns.bundle import compact, ktx2, ply
 from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS, TEXELS, BundleError, Manifest
 from bitymi_ns.bundle.surfel_table import TERMS
+from bitymi_ns.exit_messages import out_of_memory
 from bitymi_ns.files import size_text
 
 SCENE_FILES = frozenset((SURFELS, ATLAS, COMPACT_SURFELS, TEXELS))  # surfels and texels
@@ -49,7 +50,9 @@ def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
     """Convert a lack of memory into a BundleError that states the size of the files."""
     try:
         yield
-    except MemoryError as error:
+    except (MemoryError, RuntimeError) as error:
+        if not out_of_memory(error):
+            raise
         size = sum(entry.bytes for name, entry in info.files.items() if name in SCENE_FILES)
         raise BundleError(f"{bundle} needs more memory than there is: its files have {size / 1e6:.0f} MB") from error
 

@@ -4,7 +4,7 @@ Functions take float32 or float64 tensors and dispatch on device and dtype. `bak
 (`baked_cpu`) or a CUDA device (`baked_cuda`).
 """
 
-from .bands import Bands, band, by_bands, fitting_lists, split_refused
+from .bands import Bands, draw_in_bands, fitting_lists
 from .blend import blended_image, composite, soft_overdraw
 from .capacity import TooManyFragments
 from .coverage import add_texel_coverage, surfel_coverage
@@ -30,18 +30,16 @@ __all__ = [
     "TexelTiles",
     "TooManyFragments",
     "add_texel_coverage",
-    "band",
     "blended_image",
-    "by_bands",
     "can_rasterize",
     "composite",
+    "draw_in_bands",
     "field",
     "fitting_lists",
     "fragment_residual",
     "masked_counts",
     "project",
     "rasterize_image",
-    "split_refused",
     "select",
     "soft_overdraw",
     "ssim",

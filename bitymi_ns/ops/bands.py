@@ -7,6 +7,7 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from .backend import cuda_backend
 from .capacity import TooManyFragments
@@ -105,6 +106,47 @@ def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> I
         yield top, bottom, drawn
         del drawn  # may hold a list of fragments: free it before the next
         waiting = rest
+
+
+def draw_in_bands(
+    projection: Projection,
+    draw: Callable[[Projection, int | None], tuple[Tensor, Fragments]],
+    error: TooManyFragments,
+    most: int = 0,
+    rim: float = 1e-3,
+) -> tuple[Tensor, Bands]:
+    """Draw a view that has too many fragments for one list.
+
+    Args:
+        draw: draws a band, given its projection and the largest number of fragments, as in `trace`: image [pixels, C]
+            and fragments. Called again in the backward pass.
+        error: of the whole view.
+        most, rim: as in `trace`.
+
+    Returns:
+        image [H * W, C], and the fragments.
+
+    Raises:
+        TooManyFragments: a single row of tiles has too many.
+    """
+
+    def draw_band(top: int, bottom: int) -> tuple[Tensor, int]:
+        part, found = band(projection, top, bottom), []
+
+        def draw_once(geom: Tensor) -> Tensor:
+            # no limit in the backward pass: the band fitted in the forward pass
+            image, fragments = draw(replace(part, geom=geom), None if found else most)
+            found.append(len(fragments))
+            return image
+
+        image = checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False)
+        return image, found[0]
+
+    drawn = list(by_bands(split_refused(0, projection.camera.height, error), draw_band))
+    seen = replace(projection, geom=projection.geom.detach(), frames=projection.frames.detach())
+    rows = tuple((top, bottom) for top, bottom, _ in drawn)
+    count = sum(length for _, _, (_, length) in drawn)
+    return torch.cat([image for _, _, (image, _) in drawn]), Bands(seen, rows, rim, count)
 
 
 def split_refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, int]]:

@@ -19,12 +19,6 @@ class Bins:
     slot: Tensor  # [P] int32, by tile, then front to back: the pair's slot
     surfel: Tensor  # [P] int32, likewise: the pair's surfel
     tile_pairs: Tensor  # [tiles + 1] int64, first pair of each tile
-    differing: Tensor  # [1] int32, difference between listed and counted pairs; not 0: the kernels are miscompiled
-
-    @property
-    def layout(self) -> dict[str, Tensor]:
-        """Index of a fragment list, by name."""
-        return {name: value for name, value in vars(self).items() if name != "differing"}
 
 
 def int32s(like: Tensor, *shape: int) -> Tensor:
@@ -60,7 +54,6 @@ def tile_lists(geom: Tensor, projection: Projection) -> Bins:
     pairs = int(ranks["slot_start"][-1])
     check_pair_count(pairs, camera)
     lists = {"slot": int32s(geom, pairs), "surfel": int32s(geom, pairs), "tile_pairs": int64s(geom, tiles + 1)}
-    lists["differing"] = int32s(geom, 1)
     space = workspace("bin_fill", geom, pairs=pairs, width=camera.width, height=camera.height)
     kernel("bin_fill", geom)(**view, **ranks, **lists, workspace=space)
     return Bins(**ranks, **lists)

@@ -76,7 +76,7 @@ class _Rasterized(torch.autograd.Function):
             image=image,
             transmittance=transmittance,
         )
-        layout = layout_of({"masks": masks, **bins.layout}, camera.width, camera.height)
+        layout = layout_of({"masks": masks, **vars(bins)}, camera.width, camera.height)
         ctx.save_for_backward(g, b, t, texel_alpha, cuts, transmittance)
         ctx.layout, ctx.projection, ctx.rim, ctx.moves, ctx.descent = layout, projection, rim, moves, descent
         return image, layout

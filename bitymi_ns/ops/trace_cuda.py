@@ -28,14 +28,14 @@ def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
         tile_pairs=bins.tile_pairs,
         workspace=workspace("trace_mark", geom, pairs=pairs),
     )
-    return layout_of(marks | bins.layout, camera.width, camera.height)
+    return layout_of(marks | vars(bins), camera.width, camera.height)
 
 
 def layout_of(arrays: dict[str, Tensor], width: int, height: int, ids: dict[str, Tensor] | None = None) -> Layout:
     """Build the layout of P pairs of surfel and tile. Waits for the number of fragments if there are offsets.
 
     Args:
-        arrays: from `Bins.layout`, masks [TILE_WARPS, P] int32 and offsets [P + 1] int64 (none without a list).
+        arrays: of `Bins` by name, masks [TILE_WARPS, P] int32 and offsets [P + 1] int64 (none without a list).
         width, height: of the image, pixels.
         ids: surfel and pixel [F] int32 of the fragments; None: not written yet.
     """

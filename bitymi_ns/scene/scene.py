@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from bitymi_ns.ops import (
     VIEW_COLORS,
@@ -17,14 +16,12 @@ from bitymi_ns.ops import (
     Marks,
     Projection,
     TooManyFragments,
-    band,
     blended_image,
-    by_bands,
     can_rasterize,
+    draw_in_bands,
     project,
     rasterize_image,
     soft_overdraw,
-    split_refused,
     trace,
     view_color,
 )
@@ -204,7 +201,7 @@ class Scene(nn.Module):
         except TooManyFragments as error:
             if field is not None and learns:
                 read = field.snapshot()
-            image, fragments = self._draw_in_bands(projection, draw, error)
+            image, fragments = draw_in_bands(projection, draw, error, self.config.max_fragments, self.config.rim)
         return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)
 
     def _unlisted_texture(self, field_mode: Literal["train", "frozen", "off"]) -> dict[str, Any] | None:
@@ -234,32 +231,3 @@ class Scene(nn.Module):
         alpha = None if self.field is None else self.field.opacity(self.config.weight_bound, field_mode == "train")
         view = {"near": self.near, "prefilter": self.config.prefilter, "rim": self.config.rim, "alpha": alpha}
         return training_view(self.config.view_color, self.surfels, camera, photograph, correction, **texture, **view)
-
-    def _draw_in_bands(
-        self,
-        projection: Projection,
-        draw: Callable[[Projection, int | None], tuple[Tensor, Fragments]],
-        error: TooManyFragments,
-    ) -> tuple[Tensor, Bands]:
-        """Render the image [H * W, C] of a view that had too many fragments; see ops/bands.py."""
-        most, height = self.config.max_fragments, projection.camera.height
-
-        def draw_band(top: int, bottom: int) -> tuple[Tensor, int]:
-            part, found = band(projection, top, bottom), []
-
-            def draw_once(geom: Tensor) -> Tensor:
-                # no limit in the backward pass: the band fitted in the forward pass
-                image, fragments = draw(replace(part, geom=geom), None if found else most)
-                found.append(len(fragments))
-                return image
-
-            image = checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False)
-            return image, found[0]
-
-        images, rows, count = [], [], 0
-        for top, bottom, (image, length) in by_bands(split_refused(0, height, error), draw_band):
-            images.append(image)
-            rows.append((top, bottom))
-            count += length
-        seen = replace(projection, geom=projection.geom.detach(), frames=projection.frames.detach())
-        return torch.cat(images), Bands(seen, tuple(rows), self.config.rim, count)

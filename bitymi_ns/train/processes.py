@@ -17,6 +17,8 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
+from bitymi_ns.exit_messages import out_of_memory
+
 
 class ProcessLost(RuntimeError):
     """Another process of the run has ended, or does not answer."""
@@ -165,5 +167,7 @@ def raise_process_lost() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
+        if out_of_memory(error):
+            raise
         message = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ProcessLost(f"another process of the run has ended, or does not answer ({message})") from error

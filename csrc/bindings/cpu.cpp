@@ -3,6 +3,8 @@
 // Python.
 #include <nanobind/stl/optional.h>
 
+#include <cstdlib>
+
 #include "bindings/reader.h"
 
 #if defined(__GLIBC__) || __has_include(<malloc.h>)
@@ -33,9 +35,11 @@ void set_up_process() {
 #if defined(__GLIBC__)
   // Every view allocates and frees tens of megabytes; unmapping them each time costs more in page faults than computing
   // in them.
-  mallopt(M_MMAP_THRESHOLD, kFromSystem);
-  mallopt(M_TRIM_THRESHOLD, 1 << 30);
-  mallopt(M_TOP_PAD, 64 << 20);
+  if (!std::getenv("MALLOC_TRIM_THRESHOLD_")) {
+    mallopt(M_MMAP_THRESHOLD, kFromSystem);
+    mallopt(M_TRIM_THRESHOLD, 1 << 30);
+    mallopt(M_TOP_PAD, 64 << 20);
+  }
 #endif
   wait_without_spinning();
 }
@@ -153,6 +157,7 @@ template <class S> void bind_operations(nb::module_& m) {
 NB_MODULE(BITYMI_MODULE, m) {
   using namespace bt;
   nb::set_leak_warnings(false);  // tracers live until the process ends
+  use_one_thread_after_fork();
   m.doc() = "CPU kernels: see bitymi_ns.ops for their meaning.";
   m.attr("CPU_FEATURES") = BITYMI_CPU_FEATURES;  // required CPU features, as named by bitymi_ns._cpu_features
   nb::class_<Bins>(m, "Bins", "Memory for a view's tile lists, kept from frame to frame.").def(nb::init<>());

@@ -105,22 +105,25 @@ template <class S> struct TableScatter {
     return b;
   }
   void add(const FieldArrays<S>& f, S* dtable) const {
-#pragma omp parallel for num_threads(std::min(num_threads(), f.levels)) schedule(static, 1)
-    for (int l = 0; l < f.levels; ++l) {
-      S* table = dtable + f.first_entry(l) * kFeatures;
-      for (const Batch& b : batches) {
-        for (int k = 0; k < 8; ++k)
-          for (int p = 0; p < b.count; ++p) __builtin_prefetch(table + int64_t(b.index[l][k][p]) * kFeatures, 1);
-        for (int p = 0; p < b.count; ++p) {
-          Quad<S> d;
-          std::memcpy(&d, reinterpret_cast<const S*>(&b.dfeatures[p]) + l * kFeatures, sizeof d);
-          for (int k = 0; k < 8; ++k) {
-            S* entry = table + int64_t(b.index[l][k][p]) * kFeatures;
-            Quad<S> e;
-            std::memcpy(&e, entry, sizeof e);
-            e += b.weight[l][k][p] * d;
-            std::memcpy(entry, &e, sizeof e);
-          }
+    parallel_parts(f.levels, 1, [&](int, int64_t from, int64_t to) {
+      for (int l = int(from); l < to; ++l) add_level(l, dtable + f.first_entry(l) * kFeatures);
+    });
+  }
+
+ private:
+  void add_level(int l, S* table) const {
+    for (const Batch& b : batches) {
+      for (int k = 0; k < 8; ++k)
+        for (int p = 0; p < b.count; ++p) __builtin_prefetch(table + int64_t(b.index[l][k][p]) * kFeatures, 1);
+      for (int p = 0; p < b.count; ++p) {
+        Quad<S> d;
+        std::memcpy(&d, reinterpret_cast<const S*>(&b.dfeatures[p]) + l * kFeatures, sizeof d);
+        for (int k = 0; k < 8; ++k) {
+          S* entry = table + int64_t(b.index[l][k][p]) * kFeatures;
+          Quad<S> e;
+          std::memcpy(&e, entry, sizeof e);
+          e += b.weight[l][k][p] * d;
+          std::memcpy(entry, &e, sizeof e);
         }
       }
     }

@@ -21,9 +21,6 @@
 
 namespace bt {
 
-int num_threads();
-void set_num_threads(int n);
-
 template <class S> void project_forward(const ProjectForward<S>& a);
 template <class S> void project_backward(const ProjectBackward<S>& a);
 template <class S> void sparse_cosines(const SparseCosines<S>& a);

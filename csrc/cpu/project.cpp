@@ -1,4 +1,4 @@
-// Projection of surfels; number of threads.
+// Projection of surfels.
 #include <numeric>
 
 #include "core/visibility.h"
@@ -7,20 +7,6 @@
 #include "cpu/threads.h"
 
 namespace bt {
-
-namespace {
-int g_threads = 0;
-}
-
-int num_threads() {
-  if (g_threads > 0) return g_threads;
-#if defined(_OPENMP)
-  return omp_get_max_threads();
-#else
-  return 1;
-#endif
-}
-void set_num_threads(int n) { g_threads = n; }
 
 namespace {
 using P = Lanes<float>;

@@ -1,5 +1,9 @@
-// Waiting of OpenMP threads.
+// Number of threads, and how OpenMP's wait.
 #include "cpu/threads.h"
+
+#if __has_include(<pthread.h>)
+#include <pthread.h>
+#endif
 
 #if defined(_OPENMP)
 #include <algorithm>
@@ -12,6 +16,24 @@
 #endif
 
 namespace bt {
+
+namespace {
+int g_threads = 0;
+bool g_forked = false;
+}  // namespace
+
+int num_threads() {
+#if defined(_OPENMP)
+  if (!g_forked) return g_threads > 0 ? g_threads : omp_get_max_threads();
+#endif
+  return 1;
+}
+void set_num_threads(int n) { g_threads = n; }
+void use_one_thread_after_fork() {
+#if __has_include(<pthread.h>)
+  pthread_atfork(nullptr, nullptr, [] { g_forked = true; });
+#endif
+}
 
 // libgomp's threads spin for milliseconds after every parallel region, also torch's, unless OMP_WAIT_POLICY or
 // GOMP_SPINCOUNT are set. It reads these once, when torch loads it: too late for a plugin. But according to its manual

@@ -5,6 +5,7 @@
 #include <atomic>
 #include <chrono>
 #include <cstdint>
+#include <exception>
 #include <thread>
 #include <vector>
 
@@ -14,16 +15,43 @@
 
 namespace bt {
 
+// Threads of the kernels: as set, else OpenMP's. One in a forked child, whose copy of OpenMP would wait for threads
+// that only its parent has.
 int num_threads();
+void set_num_threads(int n);
+void use_one_thread_after_fork();  // registers the above
 
 // Lets idle threads sleep instead of spin, unless OMP_WAIT_POLICY or GOMP_SPINCOUNT are set; once per process.
 void wait_without_spinning();
 
-// Calls fn(thread, begin, end) over n items in equal, fixed parts.
+// Calls fn(thread, size) on `size` threads at once, at most `most`. No exception may leave a parallel region: the first
+// one is thrown again behind it.
+template <class F> void on_threads(int most, F&& fn) {
+#if defined(_OPENMP)
+  if (most > 1) {
+    std::atomic<bool> failed{false};
+    std::exception_ptr first;
+#pragma omp parallel num_threads(most)
+    {
+      try {
+        fn(omp_get_thread_num(), omp_get_num_threads());
+      } catch (...) {
+        if (!failed.exchange(true)) first = std::current_exception();
+      }
+    }
+    if (first) std::rethrow_exception(first);
+    return;
+  }
+#endif
+  fn(0, 1);
+}
+
+// Calls fn(part, begin, end) over n items in equal, fixed parts.
 template <class F> void parallel_parts(int64_t n, int64_t least, F&& fn) {
   const int parts = int(std::max<int64_t>(1, std::min<int64_t>(num_threads(), n / std::max<int64_t>(least, 1))));
-#pragma omp parallel for num_threads(parts) schedule(static, 1)
-  for (int t = 0; t < parts; ++t) fn(t, n * t / parts, n * (t + 1) / parts);
+  on_threads(parts, [&](int thread, int size) {
+    for (int p = thread; p < parts; p += size) fn(p, n * p / parts, n * (p + 1) / parts);
+  });
 }
 
 // Splits items of cumulative cost `start` into `parts` of about equal cost, depending on the input alone, so that sums
@@ -39,12 +67,13 @@ inline std::vector<int64_t> balanced_parts(const int64_t* start, int64_t items, 
   return cut;
 }
 
-// Calls fn(thread, begin, end) over tiles, balanced by fragments.
+// Calls fn(part, begin, end) over tiles, balanced by fragments.
 template <class F> int parallel_tiles(const int64_t* tile_start, int64_t tiles, int most, F&& fn) {
   const int parts = int(std::max<int64_t>(1, std::min<int64_t>(std::min(num_threads(), most), tiles)));
   const std::vector<int64_t> cut = balanced_parts(tile_start, tiles, parts);
-#pragma omp parallel for num_threads(parts) schedule(static, 1)
-  for (int t = 0; t < parts; ++t) fn(t, cut[t], cut[t + 1]);
+  on_threads(parts, [&](int thread, int size) {
+    for (int p = thread; p < parts; p += size) fn(p, cut[p], cut[p + 1]);
+  });
   return parts;
 }
 
@@ -52,6 +81,8 @@ template <class F> int parallel_tiles(const int64_t* tile_start, int64_t tiles, 
 // waking them takes 0.1 ms, as long as a small phase; a team waits awake.
 class Team {
  public:
+  struct Released {};  // thrown by meet() once a thread has failed, which will not come
+
   // Waits for all `size` threads: spinning, then yielding, after some milliseconds asleep.
   void meet(int size) {
     const uint32_t turn = turn_.load(std::memory_order_acquire);
@@ -60,25 +91,30 @@ class Team {
       turn_.fetch_add(1, std::memory_order_release);
       return;
     }
-    for (int spins = 0; turn_.load(std::memory_order_acquire) == turn; ++spins)
+    uint32_t now;
+    for (int spins = 0; (now = turn_.load(std::memory_order_acquire)) == turn && now < kReleased; ++spins)
       if (spins < kSpins)
         pause();
       else if (spins < 2 * kSpins)
         std::this_thread::yield();
       else
         std::this_thread::sleep_for(std::chrono::microseconds(20));
+    if (now >= kReleased) throw Released();
   }
+  // Ends all waiting, now and later.
+  void release() { turn_.fetch_or(kReleased, std::memory_order_release); }
   // Takes the next `count` items of the phase; returns the first.
   int64_t take(int64_t count) { return taken_.fetch_add(count, std::memory_order_relaxed); }
 
  private:
   static constexpr int kSpins = 2000;  // some tens of microseconds
+  static constexpr uint32_t kReleased = uint32_t(1) << 31;
   static void pause() {
 #if defined(__x86_64__) || defined(__i386__)
     __builtin_ia32_pause();
 #endif
   }
-  std::atomic<uint32_t> turn_{0};  // number of meetings
+  std::atomic<uint32_t> turn_{0};  // number of meetings, and kReleased
   std::atomic<int> arrived_{0};
   std::atomic<int64_t> taken_{0};
 };
@@ -95,14 +131,17 @@ struct Member {
   }
 };
 // Runs fn(member) on every thread.
-template <class F> void run_together(F&& fn) {
+template <class F> void run_together(F&& fn, int threads = num_threads()) {
   Team team;
-#if defined(_OPENMP)
-#pragma omp parallel num_threads(num_threads())
-  fn(Member{team, omp_get_thread_num(), omp_get_num_threads()});
-#else
-  fn(Member{team, 0, 1});
-#endif
+  on_threads(threads, [&](int index, int size) {
+    try {
+      fn(Member{team, index, size});
+    } catch (const Team::Released&) {  // the one that failed throws
+    } catch (...) {
+      team.release();
+      throw;
+    }
+  });
 }
 
 }  // namespace bt

@@ -34,13 +34,7 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
   list.pieces.assign(tiles, {});
   std::vector<int> current(threads, 0);
   std::atomic<int64_t> found{0};
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
-  for (int64_t tile = 0; tile < tiles; ++tile) {
-#if defined(_OPENMP)
-    const int thread = omp_get_thread_num();
-#else
-    const int thread = 0;
-#endif
+  const auto draw = [&](int thread, int64_t tile) {
     const bool keep = !most || found.load(std::memory_order_relaxed) <= most;
     auto& own = list.chunks[thread];
     int& at_chunk = current[thread];
@@ -67,7 +61,13 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
     if (keep) a.used += count, a.used_blocks += blocks;
     found.fetch_add(count, std::memory_order_relaxed);
     list.pieces[tile] = {thread, at_chunk, from, count, from_block, blocks};
-  }
+  };
+  const auto draw_some = [&](const Member& m) {
+    m.each(tiles, 4, [&](int64_t first, int64_t last) {
+      for (int64_t tile = first; tile < last; ++tile) draw(m.index, tile);
+    });
+  };
+  run_together(draw_some, threads);
   list.tile_start.assign(tiles + 1, 0), list.block_start.assign(tiles + 1, 0);
   for (int64_t t = 0; t < tiles; ++t) {
     list.tile_start[t + 1] = list.tile_start[t] + list.pieces[t].count;
@@ -103,18 +103,20 @@ template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
   }
   const bool large = list.total > kKept;
   for (size_t k = 0; k < tiles.size(); ++k) {
-#pragma omp parallel for num_threads(num_threads()) schedule(static)
-    for (int64_t i = 0; i < int64_t(tiles[k].size()); ++i) {
-      const auto& p = list.pieces[tiles[k][i]];
+    const auto copy = [&](int64_t tile) {
+      const auto& p = list.pieces[tile];
       const auto& chunk = list.chunks[p.thread][k];
-      const int64_t to = list.tile_start[tiles[k][i]];
+      const int64_t to = list.tile_start[tile];
       std::copy_n(chunk.weight + p.from, p.count, out.weight + to);
       std::copy_n(chunk.u + p.from, p.count, out.uv + to);
       std::copy_n(chunk.v + p.from, p.count, out.uv + list.total + to);
       std::copy_n(chunk.depth + p.from, p.count, out.depth + to);
       std::copy_n(chunk.sigma + p.from, p.count, out.sigma + to);
-      std::copy_n(chunk.blocks + 2 * p.from_block, 2 * p.blocks, a.blocks + 2 * list.block_start[tiles[k][i]]);
-    }
+      std::copy_n(chunk.blocks + 2 * p.from_block, 2 * p.blocks, a.blocks + 2 * list.block_start[tile]);
+    };
+    parallel_parts(int64_t(tiles[k].size()), 1, [&](int, int64_t begin, int64_t end) {
+      for (int64_t i = begin; i < end; ++i) copy(tiles[k][i]);
+    });
     if (!large) continue;
     for (auto& own : list.chunks)
       if (k < own.size()) own[k].memory.reset();  // at once, to avoid two copies of the list

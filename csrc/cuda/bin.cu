@@ -118,11 +118,11 @@ __global__ void __launch_bounds__(kThreads)
 
 // Lists the pairs, one thread per surfel by rank; a warp lists large surfels together, so that a disc in front of the
 // camera does not leave the whole screen to one thread. Counts come from another kernel, which may round differently
-// (cmake/cuda.cmake prevents that for nvcc). In any case no thread writes past its slots, slots without a tile become
-// pairs after those of all tiles, and the difference is recorded.
+// (cmake/cuda.cmake prevents that for nvcc). In any case no thread writes past its slots, and slots without a tile
+// become pairs after those of all tiles.
 template <class Kernel, class S>
 __global__ void __launch_bounds__(kThreads)
-    list_kernel(View<S> v, const int32_t* order, const int64_t* slot_start, FillSpace w, int32_t* differing) {
+    list_kernel(View<S> v, const int32_t* order, const int64_t* slot_start, FillSpace w) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = int(threadIdx.x) % kWarp, across = tiles_across(v.width);
   const int64_t from = r < v.n ? slot_start[r] : 0, count = r < v.n ? slot_start[r + 1] - from : 0;
@@ -146,7 +146,6 @@ __global__ void __launch_bounds__(kThreads)
     return at;
   };
   const auto close = [&](int32_t whose, int64_t at, int64_t end, int mine, int step) {
-    if (at != end && mine == 0) atomicAdd(differing, int32_t(at < end ? end - at : at - end));
     for (int64_t slot = at + mine; slot < end; slot += step) put(slot, across * tiles_across(v.height), whose);
   };
   bool by_warp = false;
@@ -228,11 +227,10 @@ template <class S> void bin_fill(const BinFill<S>& a, Stream stream) {
   const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
   Arena arena(a.workspace.of(bin_fill_workspace(pairs, v.width, v.height)));
   const FillSpace w(arena, pairs, tiles);
-  fill_zero(a.differing, 1, stream);
   if (pairs) {
     with_kernel(v.prefilter, [&](auto kernel) {
-      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v, a.order, a.slot_start, w,
-                a.differing);
+      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v, a.order, a.slot_start,
+                w);
     });
     sort_pairs(w.tile, w.sorted, w.slots, a.slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
     BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, a.slot, w.owner, a.surfel);

@@ -39,8 +39,7 @@ template <class S> struct BinCount {
 template <class S> int64_t bin_count_workspace(int64_t n);
 template <class S> void bin_count(const BinCount<S>& a, Stream stream);
 
-// Lists the pairs (below 2^31): writes slot [pairs], surfel [pairs], tile_pairs [tiles + 1], and differing [1], the
-// difference between listed and counted pairs, 0 unless a compiler rounds a formula in two ways. Counted pairs that are
+// Lists the pairs (below 2^31): writes slot [pairs], surfel [pairs] and tile_pairs [tiles + 1]. Counted pairs that are
 // not found come after those of the tiles.
 template <class S> struct BinFill {
   View<S> view;
@@ -49,7 +48,6 @@ template <class S> struct BinFill {
   int64_t pairs;
   int32_t *slot, *surfel;
   int64_t* tile_pairs;
-  int32_t* differing;
   Workspace workspace;
 
   template <class R> void fields(R& r) {
@@ -60,7 +58,6 @@ template <class S> struct BinFill {
     check_pairs(r, pairs);
     r.array("surfel", surfel, pairs);
     r.array("tile_pairs", tile_pairs, tiles_of(view.width, view.height) + 1);
-    r.array("differing", differing, 1);
     r.memory("workspace", workspace);
   }
 };

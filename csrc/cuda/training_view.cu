@@ -25,13 +25,13 @@ template <class S> struct ViewSpace {
   }
 };
 template <class S> struct PairSpace {
-  int32_t *slot, *surfel, *differing;  // [pairs], [pairs], [1]
-  int64_t* tile_pairs;                 // [tiles + 1]
-  uint32_t *masks, *cuts;              // [kTileWarps, pairs]; cuts is null without alpha texels
-  S *partial, *color_partial;          // [pairs, kTraceSums], [pairs, 4]
+  int32_t *slot, *surfel;      // [pairs]
+  int64_t* tile_pairs;         // [tiles + 1]
+  uint32_t *masks, *cuts;      // [kTileWarps, pairs]; cuts is null without alpha texels
+  S *partial, *color_partial;  // [pairs, kTraceSums], [pairs, 4]
   Workspace fill;
   PairSpace(Arena& arena, int64_t pairs, int width, int height, bool alpha) {
-    slot = arena.take<int32_t>(pairs), surfel = arena.take<int32_t>(pairs), differing = arena.take<int32_t>(1);
+    slot = arena.take<int32_t>(pairs), surfel = arena.take<int32_t>(pairs);
     tile_pairs = arena.take<int64_t>(tiles_of(width, height) + 1);
     masks = arena.take<uint32_t>(kTileWarps * pairs);
     cuts = alpha ? arena.take<uint32_t>(kTileWarps * pairs) : nullptr;
@@ -120,9 +120,7 @@ template <class S> int64_t count_view(const TrainingView<S>& a, Stream stream) {
 template <class S> void draw_view(const DrawView<S>& a, Stream stream) {
   const Spaces<S> s(*a.view);
   const PairSpace<S> p = s.pairs(a);
-  bin_fill(
-      BinFill<S>{s.view(), s.of.order, s.of.slot_start, a.pairs, p.slot, p.surfel, p.tile_pairs, p.differing, p.fill},
-      stream);
+  bin_fill(BinFill<S>{s.view(), s.of.order, s.of.slot_start, a.pairs, p.slot, p.surfel, p.tile_pairs, p.fill}, stream);
   rasterize_forward(RasterizeForward<S>{s.view(), s.v.alpha, s.v.table, s.v.bound, a.pairs, p.surfel, p.tile_pairs,
                                         p.masks, p.cuts, s.of.image, s.of.transmittance},
                     stream);

@@ -210,10 +210,8 @@ def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, devic
     geom, views = projection.geom, [projection, replace(projection, camera=small)]
     counted, listed = views if fewer == "listed" else reversed(views)
     bins, want = bin_cuda.tile_lists(geom, counted), bin_cuda.tile_lists(geom, listed)
-    assert int(bins.differing) == int(want.differing) == 0
     size = {"pairs": len(bins.slot), "width": listed.camera.width, "height": listed.camera.height}
     kernel("bin_fill", geom)(**listed.view(geom), **vars(bins), workspace=workspace("bin_fill", geom, **size))
-    assert int(bins.differing) > 0
     slots = bins.slot.cpu().long()
     assert torch.equal(slots.sort().values, torch.arange(len(slots)))
     rank = torch.searchsorted(bins.slot_start.cpu(), slots, right=True) - 1

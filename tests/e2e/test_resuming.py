@@ -84,7 +84,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int, how: signal.Signals
     monkeypatch.setattr(BitymiTrainer, "train_iteration", train_iteration)
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_saves_what_was_learned_and_says_how_to_go_on(
     trained: BitymiTrainerConfig,
     start: Start,

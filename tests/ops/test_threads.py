@@ -43,7 +43,12 @@ def printed(script: str, **environment: str) -> list[float]:
     """Run a script in a new process; returns the numbers it prints."""
     inherited = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "GOMP_"))}
     done = subprocess.run(
-        [sys.executable, "-c", script], env={**inherited, **environment}, capture_output=True, text=True, check=True
+        [sys.executable, "-c", script],
+        env={**inherited, **environment},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
     )
     return [float(word) for word in done.stdout.split()]
 
@@ -86,3 +91,72 @@ def test_the_users_own_choice_stands() -> None:
     if before < 0.1:
         pytest.skip("this OpenMP does not spin")
     assert after > 0.3 * before
+
+
+FAILS = """
+import resource, torch
+from bitymi_ns.ops import project, trace
+from bitymi_ns.scene import Camera
+
+def view(size):
+    return project(*surfels, Camera(torch.eye(4), torch.tensor([[512.0, 0, size / 2], [0, 512, size / 2], [0, 0, 1]]),
+                                    size, size), 0.2)
+
+N = 40  # faint discs, each larger than the picture
+means = torch.zeros(N, 3)
+means[:, 2] = torch.linspace(3, 4, N)
+surfels = (means, torch.tensor([1.0, 0, 0, 0]).repeat(N, 1), torch.full((N, 2), 2.0), torch.full((N,), -3.0),
+           torch.zeros(N))
+small = view(64)
+trace(small)
+large = view(1024)
+use = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (use + (200 << 20), resource.RLIM_INFINITY))
+failed = 0
+for _ in range(3):
+    try:
+        trace(large)
+    except MemoryError:
+        failed += 1
+resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY,) * 2)
+print(failed, int(len(trace(small)) == N * 64 * 64))
+"""
+FORKED = """
+import multiprocessing, torch
+from bitymi_ns.ops import project
+from bitymi_ns.scene import Camera
+camera = Camera(torch.eye(4), torch.tensor([[64.0, 0, 32], [0, 64, 32], [0, 0, 1]]), 64, 64)
+N = 20000
+surfels = (torch.rand(N, 3) + 2, torch.rand(N, 4), torch.zeros(N, 2), torch.zeros(N), torch.zeros(N))
+
+class Drawn(torch.utils.data.Dataset):
+    def __len__(self):
+        return 2
+    def __getitem__(self, i):
+        return project(*surfels, camera, 0.2).geom[::50].sum()  # torch's own threads do not outlive a fork
+
+def child(queue):
+    queue.put(float(Drawn()[0]))
+
+want = float(Drawn()[0])
+context = multiprocessing.get_context("fork")
+queue = context.Queue()
+process = context.Process(target=child, args=(queue,))
+process.start()
+got = queue.get(timeout=60)
+process.join()
+loaded = [float(x) for x in torch.utils.data.DataLoader(Drawn(), num_workers=2, timeout=60)]
+print(*(int(abs(each / want - 1) < 1e-5) for each in (got, *loaded)))
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits its address space")
+@pytest.mark.skipif("BITYMI_SANITIZED" in os.environ, reason="the sanitizer ends the process")
+@pytest.mark.parametrize("threads", ["1", "2"])
+def test_a_kernel_without_memory_raises_and_releases_its_threads(threads: str) -> None:
+    assert printed(FAILS, OMP_NUM_THREADS=threads) == [3, 1]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
+def test_forked_processes_draw_with_one_thread() -> None:
+    assert printed(FORKED, OMP_NUM_THREADS="2") == [1, 1, 1]

@@ -182,7 +182,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 learned = (options, refine, progress, held_out)
                 baked = bake(model.scene, views, photographs, background, *learned)
         except (ValueError, RuntimeError) as error:
-            fail(f"the scene cannot be baked: {error}", error)
+            fail(f"the scene cannot be baked: {exit_messages.line_of(error) or error}", error)
         background = tuple(model.background.tolist())
         written = {
             "statistics": {"options": asdict(baked.options), "method": config.method_name},

@@ -20,6 +20,7 @@ from bitymi_ns.bundle.parts import CAMERAS, bundle_at
 from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.world import World
 from bitymi_ns.capture.frame import UP, read_frame
+from bitymi_ns.exit_messages import line_of
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.run.model import BitymiModel
@@ -48,7 +49,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
     except (yaml.YAMLError, AttributeError, KeyError) as error:
         fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
     except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
-        detail = (str(error).strip().splitlines() or [""])[0]
+        detail = line_of(error) or (str(error).strip().splitlines() or [""])[0]
         if isinstance(error, AssertionError) and not detail:  # nerfstudio's report of another kind of file
             fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
         fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)

@@ -57,6 +57,14 @@ def newest_step(folder: Path) -> int:
     return max(steps)
 
 
+def how_to_resume(folder: Path) -> str:
+    """Say how a run with its checkpoints in `folder` goes on."""
+    saved = sorted(folder.glob("step-*.ckpt"))
+    if not saved:
+        return "No checkpoint had been written yet."
+    return f"The newest checkpoint is {saved[-1]}; resume with\n  --load-dir {folder}"
+
+
 def path_of(folder: Path, step: int) -> Path:
     """Return the path of a step's checkpoint."""
     return folder / f"step-{step:09d}.ckpt"

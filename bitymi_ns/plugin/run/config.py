@@ -17,6 +17,7 @@ from nerfstudio.plugins.types import MethodSpecification
 from torch.nn import Parameter
 from torch.optim import Adam
 
+from bitymi_ns import exit_messages
 from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.files import write_errors_as, write_file
@@ -25,7 +26,7 @@ from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
 from bitymi_ns.plugin.data.capture_checks import check_capture
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.run import run_folder, torchrun
+from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
 from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
@@ -78,6 +79,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def set_timestamp(self) -> None:
         """Set timestamp, seeds, device and absolute paths before nerfstudio writes config.yml. If a run has several
         processes, start them and exit with them; in these, all but the first copy the first one's settings."""
+        exit_messages.outlive_output()
+        exit_messages.install(lambda: checkpoints.how_to_resume(self.get_checkpoint_dir()))
         if not torchrun.own().first:
             torchrun.join(self)
             return

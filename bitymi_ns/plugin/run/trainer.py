@@ -35,6 +35,7 @@ from bitymi_ns.train.processes import ProcessesApart, ProcessLost
 if TYPE_CHECKING:
     from torch.cuda.amp.grad_scaler import GradScaler
 
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a batch system, a terminal that is gone
 AGAIN = 1.0  # seconds within which signals count as one: a batch system's arrives directly and through torchrun
 
 
@@ -164,11 +165,12 @@ class BitymiTrainer(Trainer):
                 signal.signal(number, handler)
 
     def _catch_interrupt(self) -> dict[int, Any]:
-        """Let the first Ctrl-C, or a batch system's request to end, stop the run after the current step; return the
-        previous handlers."""
+        """Let the first signal of STOPPING end the run after the current step; return the previous handlers."""
         if threading.current_thread() is not threading.main_thread():
             return {}
-        previous: dict[int, Any] = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        previous: dict[int, Any] = {number: signal.getsignal(number) for number in STOPPING}
+        if previous[signal.SIGHUP] == signal.SIG_IGN:  # by nohup
+            del previous[signal.SIGHUP]
 
         def on_interrupt(number: int, frame: Any) -> None:
             now, before = time.monotonic(), self._stop_requested
@@ -183,12 +185,7 @@ class BitymiTrainer(Trainer):
         return previous
 
     def _report_interruption(self) -> None:
-        saved = sorted(self.checkpoint_dir.glob("step-*.ckpt"))
-        if saved:
-            hint = f"The newest checkpoint is {saved[-1]}; resume with\n  --load-dir {self.checkpoint_dir}"
-        else:
-            hint = "No checkpoint had been written yet."
-        warn(f"Training was interrupted. {hint}")
+        warn(f"Training was interrupted. {checkpoints.how_to_resume(self.checkpoint_dir)}")
         raise SystemExit(INTERRUPTED)
 
     @check_main_thread

@@ -13,14 +13,14 @@ from torch import Tensor
 
 from bitymi_ns.bake import BakeOptions, RefineOptions, bake, export
 from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bundle import Bundle, check_target, read_bundle
+from bitymi_ns.bundle import Bundle, read_bundle, reserved_bundle
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.capture.image_files import in_threads, pixels_of, read_image
 from bitymi_ns.capture.lens import Lens, make_lenses
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.points import Points
-from bitymi_ns.capture.read import CaptureOptions, read_capture
+from bitymi_ns.capture.read import CaptureOptions, check_options, read_capture
 from bitymi_ns.capture.types import OPENCV_AXES, Photograph
 from bitymi_ns.ops import (
     Fragments,
@@ -41,6 +41,7 @@ from bitymi_ns.train.config import RefinePoses
 from bitymi_ns.train.fit import TrainLog, fit
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.preset import load_preset
+from bitymi_ns.train.view_checks import check_counted, check_points, checked_views, learning_modes
 from bitymi_ns.train.views import View
 
 __all__ = ["Bundle", "Camera", "View", "bake_scene", "load_capture", "rasterize", "read_bundle", "train_scene"]
@@ -68,10 +69,13 @@ def load_capture(
         colors: [M, 3] in [0, 1].
 
     Raises:
-        CaptureError: a ValueError; the capture cannot be used. Names the file and the entry, and says what to do.
+        CaptureError: a ValueError; the capture cannot be used, or an option is out of range. Names the file and the
+            entry, and says what to do.
         TypeError, KeyError: there is no such option, or part.
     """
-    capture = read_capture(CaptureOptions(data=Path(path), **options))
+    asked = CaptureOptions(data=Path(path), **options)
+    check_options(asked)
+    capture = read_capture(asked)
     every = capture.photographs
     chosen = every if part == "all" else [every[i] for i in capture.parts[part]]
     pairs = zip(chosen, make_lenses(chosen, capture.downscale), strict=True)
@@ -85,7 +89,7 @@ def _view(source: tuple[Photograph, Lens]) -> View:
     to = lens.pinhole
     image = lens.undistort(read_image(photograph.file, lens.stored, lens.camera.size))
     viewmat = torch.from_numpy(np.linalg.inv(photograph.pose @ OPENCV_AXES @ lens.turn)).float()
-    K = torch.tensor([[to.fx, 0.0, to.cx], [0.0, to.fy, to.cy], [0.0, 0.0, 1.0]])
+    K = torch.tensor([[to.fx, 0.0, to.cx], [0.0, to.fy, to.cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
     mask = None if photograph.mask is None else checked_mask(photograph.mask)
     whole = mask is None and lens.whole
     counts = None if whole else torch.from_numpy(np.array(lens.undistort_mask(mask, photograph.mask)))
@@ -176,6 +180,7 @@ def _logit(share: Tensor) -> Tensor:
     return torch.logit(share + (nearest - share).detach())
 
 
+@learning_modes()
 def train_scene(
     views: Sequence[View],
     points: Tensor,
@@ -209,14 +214,13 @@ def train_scene(
         refined, give `bake_scene` the views with these cameras.
 
     Raises:
-        ValueError: there are no views, points or colors are not [M, 3], or an option is out of range.
+        ValueError: there are no views, their masks exclude everything, a view, points or colors are not as stated (the
+            view's index is named), an option is out of range, or torch is in inference mode.
         PresetError: there is no such preset.
     """
-    if len(views) == 0:
-        raise ValueError("there is nothing to train on: no views")
-    for name, values in (("points", points), ("colors", colors)):
-        if values.ndim != 2 or values.shape[1] != 3 or len(values) != len(points):
-            raise ValueError(f"{name} have to be [M, 3], as many as points, not {list(values.shape)}")
+    views, eval_views = checked_views(views), checked_views(eval_views, "eval_views")
+    check_counted(views)
+    check_points(points, colors)
     preset = load_preset(method)
     config = replace(copy.deepcopy(preset.train), seed=seed, refine_poses=refine_poses)
     scene = scene_for_views(views, points, colors, preset.scene, config, steps)
@@ -225,6 +229,7 @@ def train_scene(
     return scene, fit(scene, views, [view.to(device) for view in eval_views], config, steps, step_done)
 
 
+@learning_modes()
 def bake_scene(
     scene: Scene,
     views: Sequence[View],
@@ -251,16 +256,18 @@ def bake_scene(
         The bundle as read from the folder, with the cameras of the views.
 
     Raises:
-        ValueError: there are no views, no surfel is left, the atlas would be too large, or an option is out of range.
-        BundleError: the folder exists or cannot be written.
+        ValueError: as `train_scene`; no surfel is left, or the atlas would be too large.
+        BundleError: the folder exists or cannot be written, which is tried first, or what was written cannot be read;
+            an earlier bundle then stays.
         RuntimeError: the format is bc7, and its encoder is not installed.
     """
-    if len(views) == 0:
-        raise ValueError("there is nothing to bake from: no views")
-    background = torch.zeros(3) if background is None else background.cpu()
+    views = checked_views(views)
+    check_counted(views)
+    background = torch.zeros(3, dtype=torch.float32) if background is None else background.float().cpu()
+    if background.shape != (3,) or not bool(torch.isfinite(background).all()):
+        raise ValueError(f"background has to be a finite color [3], not {background.tolist()}")
     options = options or BakeOptions()
     options.check()
-    check_target(folder, overwrite)
     cameras = [view.camera for view in views]
     rows = [CapturedCamera.of(f"{i:04d}", v.camera, False, correction=v.correction) for i, v in enumerate(views)]
     listed = cameras_data(rows)
@@ -270,7 +277,7 @@ def bake_scene(
             raise ValueError(f"target_mb is for compact bundles, and this one's format is {options.bundle_format}")
         compact = compact.fitting(target_mb, len(listed))
     refine = RefineOptions.for_scene(scene, len(views), compact=compact)
-    baked = bake(scene, cameras, views, background, options, refine)
     where = {"first": cameras[0], "extra_files": {CAMERAS: listed}, "overwrite": overwrite}
-    export(baked, folder, background=background.tolist(), **where)
-    return read_bundle(folder)
+    with reserved_bundle(folder, overwrite):
+        baked = bake(scene, cameras, views, background, options, refine)
+        return export(baked, folder, background=background.tolist(), **where)

@@ -212,9 +212,9 @@ class Pack:
 
         bundle = Path(os.path.realpath(self.bundle))
         output = self.output or bundle.with_name(bundle.name + SUFFIX)
-        if output.exists() and not self.overwrite:
+        if os.path.lexists(output) and not self.overwrite:
             raise ValueError(f"{output} is there already: choose another path (--output), or add --overwrite")
-        if output.exists() and not is_single(output):
+        if os.path.lexists(output) and not is_single(output):
             raise ValueError(f"{output} is no bundle and is not replaced: choose another path (--output)")
         with write_errors_as(output, ValueError):
             written = write_single(bundle, output)
@@ -260,7 +260,6 @@ class Extras:
         from bitymi_ns.progress import rich_progress
 
         output = self.output or interchange.extras_folder(self.bundle)
-        interchange.check_extras(self.kinds, output, self.overwrite)
         bundle = read_bundle(self.bundle, crop=self.crop)
         cameras = interchange.training_cameras(bundle)
         held_out = [] if self.crop else interchange.read_held_out(self.bundle, bundle)

@@ -1,4 +1,4 @@
-"""Atomic writes of files and folders with locks, and explanations of failed writes.
+"""Atomic writes of files and folders, and explanations of failed writes.
 
 Files are written as `.NAME.unfinished`, folders as `.NAME.new`, flushed, then renamed; a replaced folder is `.NAME.old`
 in between. Writers hold a lock, which the kernel releases when they end. The names are fixed, so that the next writer
@@ -7,10 +7,8 @@ finds the remains of a killed process, and restores or removes them."""
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 import shutil
-import socket
 import threading
 import warnings
 from collections.abc import Callable, Iterator
@@ -20,21 +18,8 @@ from typing import BinaryIO
 
 from rich.filesize import decimal
 
-from bitymi_ns.trust import UNFINISHED, Refused, is_left, no_links
-
-Tell = Callable[[str], None]  # receives a warning for the user
-
-
-class Busy(BlockingIOError):
-    """Error if another process writes the same file or folder; `who` names it, if known, and says what to do."""
-
-    def __init__(self, who: str) -> None:
-        super().__init__(errno.EAGAIN, who)
-        self.who = who
-
-    def __str__(self) -> str:
-        return self.who
-
+from bitymi_ns.locks import Busy, Tell, held, hold, open_locked, release
+from bitymi_ns.trust import UNFINISHED, Refused, is_left
 
 _REASONS = {
     errno.EROFS: "the file system is read-only: write to another one",
@@ -47,7 +32,7 @@ _REASONS = {
     errno.EISDIR: "it is a folder, not a file: choose another name",
     errno.ELOOP: "a link in its path leads back to itself: choose another path",
     errno.EBUSY: "it is in use by the system, as a mount point is: choose a folder in it",
-    errno.EXDEV: "it is a mount point: choose a folder in it",
+    errno.EXDEV: "it lies in a lower layer of an overlay, as an image's folders in a container do: choose another name",
     errno.EIO: "the disk reports an error of its own: check it, or write to another disk",
     errno.EMFILE: "too many files are open: allow more (see `ulimit -n`)",
     errno.ENFILE: "too many files are open on this machine: end other programs",
@@ -69,13 +54,24 @@ def reason(error: OSError, path: Path) -> str:
 @contextmanager
 def write_errors_as(path: Path, kind: type[BaseException], then: str = "") -> Iterator[None]:
     """Convert OSErrors in the block to exceptions of type `kind` that explain why `path` cannot be written; `then` is
-    appended to the message."""
+    appended to the message. Errors that name a file elsewhere pass."""
     try:
         yield
     except OSError as error:
-        if error.errno is None:  # raised by this package, with its own message
+        if error.errno is None or not _concerns(error.filename, path):
             raise
         raise kind(f"{path} cannot be written: {reason(error, path)}{then}") from error
+
+
+def _concerns(name: object, path: Path) -> bool:
+    """Return True for an error's file that is in the way of writing `path`, belongs to the result, or is unknown."""
+    if not isinstance(name, (str, os.PathLike)):
+        return True
+    near, place = Path(os.path.realpath(name)), Path(os.path.realpath(path))
+    if near in (place, *place.parents):
+        return True
+    beside = near.parts[len(place.parent.parts)] if near.is_relative_to(place.parent) else ""
+    return beside == place.name or beside.startswith(f".{place.name}.")
 
 
 def free_bytes(path: Path) -> int:
@@ -106,114 +102,16 @@ def parents_of(path: Path) -> Iterator[None]:
                 parent.rmdir()
 
 
-def _open_locked(path: Path) -> tuple[BinaryIO, bool]:
-    """Open or create a file for writing, and lock it until all processes that have it open close it. Returns the file,
-    and True if it is locked; False if the file system does not support locks.
-
-    Raises:
-        BlockingIOError: another process has the lock.
-        OSError: it cannot be opened, or is refused by `no_links`."""
-    while True:
-        file = open(path, "r+b", opener=no_links)
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.close()
-            raise
-        except OSError:
-            return file, False
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(file.fileno()), os.lstat(path)):
-                return file, True
-        file.close()  # the previous holder has removed or renamed it in the meantime
-
-
-class Lock:
-    """Lock file of one process. It contains the process's number, for the message to others, and is removed on release;
-    the file of a killed process does not block."""
-
-    def __init__(self, path: Path, tell: Tell = warnings.warn) -> None:
-        """
-        Args:
-            path: of the file; its folder must exist.
-            tell: called if the file system has no locks; the lock is then ineffective.
-
-        Raises:
-            Busy: another process holds it.
-            OSError: the file cannot be created.
-        """
-        self.path, self._owner = path, os.getpid()
-        try:
-            self._file, locked = _open_locked(path)
-        except BlockingIOError:
-            raise Busy(_holder(path)) from None
-        if not locked:
-            tell(f"{path.parent} is on a file system without locks: see that no other process writes there.")
-        self.name(self._owner)
-
-    def name(self, process: int) -> None:
-        """Write the working process's number to the file, for the message to others; write errors are ignored."""
-        with suppress(OSError):
-            self._file.seek(0)
-            self._file.truncate()
-            self._file.write(f"{process} {socket.gethostname()}\n".encode())
-            self._file.flush()
-
-    def fileno(self) -> int:
-        """Return the descriptor that holds the lock; a child that inherits it also holds the lock."""
-        return self._file.fileno()
-
-    def release(self) -> None:
-        """Release the lock; a second call, or one in a forked child, does nothing."""
-        if not self._file.closed and self._owner == os.getpid():
-            with suppress(OSError):
-                self.path.unlink()
-            with suppress(OSError):
-                self._file.close()
-
-    def __enter__(self) -> Lock:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.release()
-
-
-def _holder(path: Path) -> str:
-    """Describe the holder of a lock, and what to do."""
-    try:
-        process, host = path.read_text("utf8").split()
-    except (OSError, ValueError):  # just released, or not yet named
-        return "another process is writing there: wait for it, or end it"
-    where = "" if host == socket.gethostname() else f" on {host}"
-    return f"process {process}{where} is writing there: wait for it, or end it (kill {process})"
-
-
-_held: dict[tuple[str, int], Lock] = {}  # locks by file and thread, to make them reentrant
-
-
-def hold(path: Path, tell: Tell = warnings.warn) -> None:
-    """Acquire the lock on a file, unless this thread has it already; see `Lock`."""
-    key = (os.path.realpath(path), threading.get_ident())
-    if key not in _held:
-        _held[key] = Lock(path, tell)
-
-
-def release(path: Path) -> None:
-    """Release the lock of `hold`, if any."""
-    lock = _held.pop((os.path.realpath(path), threading.get_ident()), None)
-    if lock is not None:
-        lock.release()
-
-
 @contextmanager
-def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
-    """Lock the path of a file or folder, and repair the remains of a killed process there.
+def reserved(target: str | Path, check: Callable[[], None] | None = None, tell: Tell = warnings.warn) -> Iterator[Path]:
+    """Lock the path of a file or folder, and repair the remains of a killed process there. Since this writes beside the
+    target, it fails early if nothing can be written there.
 
-    Creates missing parents, and removes those that remain empty. Since this writes beside the target, it fails early if
-    nothing can be written there.
+    Creates missing parents, and removes those that remain empty.
 
     Args:
         target: to be written in the block; reservations of one thread may be nested.
+        check: for a folder: raises if the existing one may not be replaced. None: the target is a file.
         tell: called if the file system has no locks.
 
     Yields:
@@ -221,17 +119,23 @@ def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
 
     Raises:
         Busy: another process is writing it.
-        OSError: nothing can be written there; `reason` says why.
+        OSError: nothing can be written there, or it is a folder instead of a file, or a file or a link to nothing
+            instead of a folder; `reason` says why.
     """
     place = Path(os.path.realpath(target))
-    if os.path.ismount(place):
-        raise OSError(errno.EBUSY, os.strerror(errno.EBUSY), str(place))
+    kind = errno.EBUSY if os.path.ismount(place) else 0
+    if not kind and os.path.lexists(target) and place.is_dir() != (check is not None):
+        kind = errno.EISDIR if check is None else errno.ENOTDIR
+    if kind:
+        raise OSError(kind, os.strerror(kind), str(place))
     lock = place.with_name(f".{place.name}.lock")
-    outermost = (str(lock), threading.get_ident()) not in _held
+    outermost = (str(lock), threading.get_ident()) not in held
     with parents_of(place):
         hold(lock, tell)
         try:
             _recover(place)
+            if check is not None:
+                check()
             yield place
         finally:
             if outermost:
@@ -239,7 +143,7 @@ def reserved(target: str | Path, tell: Tell = warnings.warn) -> Iterator[Path]:
 
 
 def check_writable(target: Path) -> None:
-    """Check in advance that a file or folder can be written; raises what `reserved` raises."""
+    """Check in advance that a file can be written; raises what `reserved` raises."""
     if not _is_device(target):
         with reserved(target):
             pass
@@ -293,8 +197,7 @@ def complete_folder(
         Busy: another process is writing it.
         OSError: it cannot be written; `reason` says why.
     """
-    with reserved(target, tell) as place:
-        check()
+    with reserved(target, check, tell) as place:
         new, old = _temporary_paths(place)
         try:
             new.mkdir()
@@ -313,21 +216,24 @@ def complete_folder(
 
 
 @contextmanager
-def complete_file(path: Path, scratch: Path | None = None) -> Iterator[BinaryIO]:
+def complete_file(path: Path, scratch: Path | None = None, follow: bool = False) -> Iterator[BinaryIO]:
     """Open a temporary file that replaces `path` if the block ends without an exception.
 
     Args:
         path: the file; missing parents are created.
+        follow: write through a link, for a path that the user gave; False: replace the link, for files of a folder that
+            may come from others.
         scratch: folder on the same file system for the unfinished file; None: that of `path`.
 
     Raises:
         Busy: another process is writing it.
         OSError: it cannot be written; `reason` says why.
     """
+    path = Path(os.path.realpath(path)) if follow else path
     unfinished = (scratch or path.parent) / f".{path.name}{UNFINISHED}"
     with parents_of(path):
         try:
-            file, _ = _open_locked(unfinished)
+            file, _ = open_locked(unfinished)
         except BlockingIOError:
             raise Busy("another process is writing it: wait for it, or end it") from None
         try:
@@ -354,12 +260,12 @@ def copy_files(folder: Path, to: Path) -> None:
             shutil.copyfile(path, to / path.name)
 
 
-def write_file(path: Path, data: bytes) -> None:
+def write_file(path: Path, data: bytes, follow: bool = False) -> None:
     """Write a file atomically, see `complete_file`; devices and pipes are written directly."""
     if _is_device(path):
         path.write_bytes(data)
         return
-    with complete_file(path) as file:
+    with complete_file(path, follow=follow) as file:
         file.write(data)
 
 
@@ -367,7 +273,7 @@ def remove_unfinished(folder: Path) -> None:
     """Remove unfinished files of ended processes; errors are ignored."""
     for path in folder.glob(f".*{UNFINISHED}"):
         with suppress(OSError):
-            file, locked = _open_locked(path)
+            file, locked = open_locked(path)
             with file:
                 if locked:
                     path.unlink()

@@ -10,6 +10,7 @@ from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bake.early_stopping import EarlyStopping
 from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.manifest import dump
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.reference.project import Projection
@@ -157,7 +159,7 @@ def test_what_cannot_be_trained_or_baked_is_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             bitymi_ns.train_scene(views, points, colors)
-    with pytest.raises(ValueError, match="nothing to bake from: no views"):
+    with pytest.raises(ValueError, match="nothing to learn from: no views"):
         bitymi_ns.bake_scene(None, [], tmp_path / "bundle")
     stopping = EarlyStopping(0, 10, 3, 20.0, "first")
     assert stopping.due(0) and stopping.best == "first"
@@ -236,6 +238,13 @@ def test_bundles_of_every_format_with_their_cameras(room: Path, tmp_path: Path) 
     ):
         with pytest.raises(ValueError, match=message):
             bitymi_ns.bake_scene(scene, views, tmp_path / "smaller", options=options, target_mb=most)
+    with pytest.raises(ValueError, match="a bundle takes from 0.01 to 100,000 MB, not nan"):
+        bitymi_ns.bake_scene(scene, views, tmp_path / "smaller", target_mb=float("nan"))
+    before = (tmp_path / "bundle" / "bundle.json").read_bytes()
+    nan = views[0]._replace(image=torch.full(views[0].image.shape, torch.nan))
+    with pytest.raises(ValueError, match=r"views\[0\].image has to be finite"):
+        bitymi_ns.bake_scene(scene, [nan, *views[1:]], tmp_path / "bundle", overwrite=True)
+    assert (tmp_path / "bundle" / "bundle.json").read_bytes() == before
     for options, message in (
         (BakeOptions(format="webp"), "no format 'webp': choose among compact, bc7, uint8, fp16"),
         (BakeOptions(format="compact", tolerance=0.0), "compact bundle needs a tolerance"),
@@ -243,7 +252,7 @@ def test_bundles_of_every_format_with_their_cameras(room: Path, tmp_path: Path) 
         with pytest.raises(ValueError, match=message):
             bitymi_ns.bake_scene(scene, views, tmp_path / "bundle", options=options, overwrite=True)
     with pytest.raises(ValueError, match="no preset 'nerf' in .*, which has bitymi, bitymi-fast"):
-        bitymi_ns.train_scene(views, points, points, method="nerf")
+        bitymi_ns.train_scene(views, points, points.clamp(0, 1), method="nerf")
 
 
 def test_a_bundle_of_an_earlier_version_is_replaced(room: Path, tmp_path: Path) -> None:
@@ -260,6 +269,21 @@ def test_a_bundle_of_an_earlier_version_is_replaced(room: Path, tmp_path: Path) 
     (tmp_path / "bundle" / "letter.txt").write_text("dear")
     with pytest.raises(BundleError, match="also holds letter.txt"):
         bitymi_ns.bake_scene(scene, views, tmp_path / "bundle", overwrite=True)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"downscale_factor": 0}, "downscale_factor is 0, but has to be 1 or more"),
+        ({"downscale_factor": -1}, "downscale_factor is -1"),
+        ({"downscale_factor": float("nan")}, "downscale_factor is nan"),
+        ({"points": "nope"}, "points is nope, but has to be one of"),
+        ({"eval_interval": 0}, "eval_interval is 0"),
+    ],
+)
+def test_options_of_captures_are_checked(room: Path, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(CaptureError, match=message):
+        bitymi_ns.load_capture(room, **options)
 
 
 @pytest.mark.parametrize("method", ["bitymi-field", "bitymi-notexture"])

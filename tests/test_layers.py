@@ -17,6 +17,7 @@ ORDER = ["ops", "scene", "codec", "bundle", "train", "bake", "interchange", "vie
 BESIDE = [
     "exit_messages",
     "files",
+    "locks",
     "ply",
     "presets",
     "progress",

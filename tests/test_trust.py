@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bitymi_ns import files
+from bitymi_ns import files, locks
 from bitymi_ns.capture.cache import content_key, home, keep_work_folder, user_cache, work_folder
 from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.sfm import process
@@ -52,7 +52,7 @@ Plant = Callable[[Path, Path], None]
 
 
 def lock(where: Path) -> None:
-    with files.Lock(where / "planted"):
+    with locks.Lock(where / "planted"):
         pass
 
 

@@ -66,8 +66,10 @@ class Compact:
         config.yml take `beside` bytes.
 
         Raises:
-            ValueError: nothing is left for surfels and texels.
+            ValueError: the limit is out of range, or nothing is left for surfels and texels.
         """
+        if not 0.01 <= megabytes <= 1e5:
+            raise ValueError(f"a bundle takes from 0.01 to 100,000 MB, not {megabytes}")
         size = int(1e6 * megabytes)
         beside += MANIFEST_BYTES + poster_bytes(size)
         if size <= beside:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy.typing as npt
 import torch
@@ -32,10 +33,11 @@ class Pictures:
     ) -> None:
         """
         Args:
-            views: training views, of which `most` are taken, spread over all.
+            views: training views, of which up to `most` with an unmasked pixel are taken, spread over all.
             background: [3] colour behind the scene.
         """
-        chosen = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
+        taken = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
+        chosen = [*filter(_counts, taken)] or [*islice(filter(_counts, views), most)]
         self._device, self._background = device, background.to(device)
         self._targets = [view.target(self._background, device) for view in chosen]
         self._views = [v._replace(image=t).to(device) for v, t in zip(chosen, self._targets, strict=True)]
@@ -61,6 +63,10 @@ class Pictures:
         pairs = zip(pictures, self._targets, self._masks, strict=True)
         found = [psnr(a, b, m) for a, b, m in pairs if m is None or bool(m.any())]
         return sum(found) / max(1, len(found))
+
+
+def _counts(view: View) -> bool:
+    return view.mask is None or bool(view.mask.any())
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.view_colors import ColorChoices
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.poster import draw_poster
+from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.statistics import AtlasCost, Statistics
 from bitymi_ns.bundle.write import write_bundle
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
@@ -208,8 +209,8 @@ def export(
     statistics: Mapping[str, Any] | None = None,
     first: Camera | None = None,
     **options: Any,
-) -> Path:
-    """Encode a baked scene, unless encoded, and write a bundle; raises what `write_bundle` raises.
+) -> Bundle:
+    """Encode a baked scene, unless encoded, and write a bundle; returns and raises as `write_bundle`.
 
     Args:
         background: colour behind the surfels.

@@ -1,7 +1,7 @@
 """Bundles, the folders of baked scenes (surfels, atlas, description): writing, reading, checking."""
 
 from bitymi_ns.bundle.manifest import BundleError
-from bitymi_ns.bundle.parts import check_target
+from bitymi_ns.bundle.parts import reserved_bundle
 from bitymi_ns.bundle.read import REMEDY, Bundle, read_bundle
 from bitymi_ns.bundle.verify import Check, check_files, check_world
 from bitymi_ns.bundle.world import World
@@ -15,7 +15,7 @@ __all__ = [
     "World",
     "check_files",
     "check_world",
-    "check_target",
     "read_bundle",
+    "reserved_bundle",
     "write_bundle",
 ]

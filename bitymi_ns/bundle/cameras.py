@@ -68,14 +68,14 @@ class CapturedCamera(BaseModel):
     @property
     def exposure(self) -> Tensor | None:
         """Convert the correction to gains [3] or matrix and offset [3, 4]."""
-        found = None if self.correction is None else torch.tensor(self.correction)
+        found = None if self.correction is None else torch.tensor(self.correction, dtype=torch.float32)
         return found if found is None or len(found) == 3 else found.view(3, 4)
 
     @property
     def camera(self) -> Camera:
         """Convert to a camera on the CPU."""
-        K = torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
-        return Camera(torch.tensor(self.viewmat).view(4, 4), K, self.width, self.height)
+        K = torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
+        return Camera(torch.tensor(self.viewmat, dtype=torch.float32).view(4, 4), K, self.width, self.height)
 
 
 def cameras_data(cameras: Iterable[CapturedCamera]) -> bytes:

@@ -84,7 +84,11 @@ def points_of(text: str) -> Tensor:
         raise PydanticCustomError(
             "points", "must hold rows of four float32 numbers, at most {most}", {"most": _MOST_POINTS}
         )
-    points = torch.frombuffer(bytearray(data), dtype=torch.float32).view(-1, 4) if data else torch.zeros(0, 4)
+    points = (
+        torch.frombuffer(bytearray(data), dtype=torch.float32).view(-1, 4)
+        if data
+        else torch.zeros(0, 4, dtype=torch.float32)
+    )
     low, high = _RATES
     good = (points[:, :3].abs() <= LIMITS["means"][0]).all() and ((points[:, 3] >= low) & (points[:, 3] <= high)).all()
     if not bool(good):  # also for NaN

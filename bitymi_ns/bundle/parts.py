@@ -3,8 +3,9 @@
 import os
 import re
 import struct
+import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
@@ -20,6 +21,8 @@ from bitymi_ns.bundle.manifest import (
     Manifest,
     dump,
 )
+from bitymi_ns.files import reserved, write_errors_as
+from bitymi_ns.locks import Tell
 from bitymi_ns.trust import check_replaceable, json_of
 
 MANIFEST_LIMIT = 4 << 20  # largest bundle.json, bytes
@@ -245,7 +248,7 @@ def _is_archive(path: Path) -> bool:
 
 
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
-    """Check that a bundle may be written to a folder, before the work of baking it.
+    """Check that a bundle may be written to a folder.
 
     Raises:
         BundleError: it exists and `overwrite` is off; or it is not a bundle, or holds foreign files, or a notes.json
@@ -254,6 +257,20 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
     folder = Path(folder)
     made = _replaced(folder) if (folder / MANIFEST).is_file() else None
     check_replaceable(folder, f"a bundle (it has no {MANIFEST})", made, overwrite, BundleError, "--overwrite True")
+
+
+@contextmanager
+def reserved_bundle(folder: str | Path, overwrite: bool, tell: Tell = warnings.warn) -> Iterator[None]:
+    """Lock the folder of a bundle for the block, before the work of baking it.
+
+    Raises:
+        BundleError: as `check_target`, or the folder is in use or cannot be written.
+    """
+    folder = Path(folder)
+    with ExitStack() as stack:
+        with write_errors_as(folder, BundleError):
+            stack.enter_context(reserved(folder, lambda: check_target(folder, overwrite), tell))
+        yield
 
 
 def _replaced(folder: Path) -> Iterator[str]:

@@ -89,7 +89,7 @@ class Bundle:
             maps: also beta, depth, normals and overdraw.
         """
         if background is None:
-            background = torch.tensor(self.info.render.background, device=self.scene.tiles.device)
+            background = torch.tensor(self.info.render.background, device=self.scene.tiles.device, dtype=torch.float32)
         return self.scene.render(camera, background, maps)
 
 

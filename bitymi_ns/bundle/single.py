@@ -14,7 +14,7 @@ from bitymi_ns.bundle.notes import read_notes
 from bitymi_ns.bundle.parts import MANIFEST_LIMIT, NOTES, Parts, is_known, left_out, parts_of, public_manifest
 from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
 from bitymi_ns.bundle.sizes import enough_memory, machine_memory
-from bitymi_ns.files import complete_folder, size_text, write_file
+from bitymi_ns.files import complete_file, complete_folder, size_text
 
 _ORDER = (POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
 SUFFIX = ".bitymi"
@@ -43,7 +43,13 @@ def write_single(bundle: str | Path, path: str | Path) -> SingleFile:
         BundleError: no bundle, a file is missing or altered, or memory is insufficient.
     """
     data, written = joined(bundle)
-    write_file(Path(path), data)
+    with complete_file(Path(path), follow=True) as file:
+        file.write(data)
+        file.flush()
+        with parts_of(file.name) as parts:
+            info = manifest_of(parts)
+            for name in info.files:
+                read_file(parts, info, name, keep=False)
     return written
 
 

@@ -56,7 +56,7 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
     entry = VIEW_COLORS[kind]
     if entry.mean is not None and "view_terms" not in surfels:
         return entry.mean(*entry.of(surfels))
-    n, origin = len(surfels["means"]), torch.zeros(3)
+    n, origin = len(surfels["means"]), torch.zeros(3, dtype=torch.float32)
     parts = [view_color(kind, surfels, d.expand(n, 3).contiguous(), origin) for d in fibonacci_sphere(32)]
     return torch.stack(parts).mean(0)
 
@@ -77,7 +77,7 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
         color = color + scene.mean_residual
     color = color.nan_to_num(0.0).clamp(-0.5, 0.5) / SH_C0  # (mean colour - 0.5) / SH_C0
     quats = torch.nn.functional.normalize(surfels["quats"], dim=1)
-    flat = torch.full((len(quats), 1), FLAT_LOG_SCALE)
+    flat = torch.full((len(quats), 1), FLAT_LOG_SCALE, dtype=torch.float32)
     groups: dict[tuple[str, ...], Tensor] = {
         COLUMNS["means"]: surfels["means"],
         _numbered("f_dc", 3): color,
@@ -186,7 +186,7 @@ def from_columns(
     turned = (surfels["quats"].norm(dim=1) - 1.0).abs() > UNIT_SLACK
     if turned.any():
         raise PlyError(f"rot_0 to rot_3 are not of length 1 in row {int(torch.nonzero(turned)[0])}")
-    residual = torch.zeros(count, 3)
+    residual = torch.zeros(count, 3, dtype=torch.float32)
     if COLUMNS["mean_residual"][0] in columns:
         residual = _stack(columns, COLUMNS["mean_residual"])
         _check_limits({"mean_residual": residual}, kind)
@@ -194,7 +194,9 @@ def from_columns(
     return {
         "surfels": surfels,
         "tiles": tiles.contiguous(),
-        "extent": _bounded(columns, EXTENT_COLUMN, *EXTENTS) if stated else torch.full((count,), extent),
+        "extent": _bounded(columns, EXTENT_COLUMN, *EXTENTS)
+        if stated
+        else torch.full((count,), extent, dtype=torch.float32),
         "mean_residual": residual,
         "mean_alpha": _bounded(columns, ALPHA_COLUMN, 0.0, ALPHA_LIMIT) if has_alpha else None,
     }
@@ -206,7 +208,7 @@ def _full_from_columns(columns: Mapping[str, npt.NDArray], kind: str, count: int
         found = [int(column[len(name) + 1 :]) for column in columns if _is_number_of(column, name)]
         if sorted(found) != list(range(len(found))) or len(found) % width or (-1 not in shape and len(found) != width):
             raise PlyError(f"the view colour needs {name}_0.. in groups of {width}, not {len(found)} columns")
-        values = _stack(columns, _numbered(name, len(found))) if found else torch.zeros(count, 0)
+        values = _stack(columns, _numbered(name, len(found))) if found else torch.zeros(count, 0, dtype=torch.float32)
         surfels[name] = values.reshape(count, *(len(found) // width if size < 0 else size for size in shape))
     if len({surfels[p.name].shape[1] for p in entry.parameters if -1 in p.shape}) != 1:
         raise PlyError(f"the parameters of {entry.title} disagree about the number of {entry.term}s")

@@ -32,6 +32,7 @@ from bitymi_ns.bundle.manifest import (
 )
 from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, encode_poster, most_bytes
+from bitymi_ns.bundle.read import Bundle, read_bundle
 from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_fault, term_columns, to_columns
 from bitymi_ns.bundle.world import World
 from bitymi_ns.codec.limits import ALPHA_LIMIT
@@ -60,8 +61,8 @@ def write_bundle(
     overwrite: bool = False,
     interchange: bool = False,
     poster: Pixels | None = None,
-) -> Path:
-    """Write a bundle; the folder appears complete or not at all.
+) -> Bundle:
+    """Write a bundle and read it, before it replaces an earlier one; the folder appears complete or not at all.
 
     Args:
         scene: on the CPU, all numbers finite; its own atlas is ignored. Mean residuals are also added to the colour
@@ -78,11 +79,11 @@ def write_bundle(
         poster: [H, W, 3] picture of the viewer's first view.
 
     Returns:
-        the folder.
+        the bundle as read.
 
     Raises:
-        BundleError: the target exists or cannot be written, or a parameter is not finite or beyond its limit
-            (`limits.py`, `manifest.py`).
+        BundleError: the target exists or cannot be written, a parameter is not finite or beyond its limit
+            (`limits.py`, `manifest.py`), or what was written cannot be read.
     """
     folder = Path(folder)
     surfels = scene.surfels
@@ -117,12 +118,15 @@ def write_bundle(
                 notes = notes_data(earlier)
             if notes is not None:
                 (new / NOTES).write_bytes(notes)
+            try:
+                return read_bundle(new)
+            except BundleError as error:
+                raise BundleError(f"{folder} was not written, since it could not be read: {error}") from error
     except OSError as error:
         size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
         needs = f" (it needs about {size_text(size)})" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         why = reason(error, folder)
         raise BundleError(f"{folder} cannot be written{needs}: {why}. Nothing was left behind") from error
-    return folder
 
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:

@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Literal
 
-from bitymi_ns import files
+from bitymi_ns import files, locks
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import Tell, write_file
 from bitymi_ns.safe_reading import read_json
@@ -48,8 +48,8 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
             own_folder(root, close=True)
             own_folder(folder)
             check_no_links(folder.iterdir())
-            lock = files.Lock(folder / ".lock", tell=lambda text: None)
-        except files.Busy as error:
+            lock = locks.Lock(folder / ".lock", tell=lambda text: None)
+        except locks.Busy as error:
             raise CaptureError(f"{kind} of {photographs} are being found already: {error}") from error
         except OSError as error:
             if root == beside and isinstance(error, Refused):
@@ -99,9 +99,9 @@ def replace_stale(work: Path, photographs: Path, contents: str) -> None:
     for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
         if other != work and is_own(other) and _is_stale(other, source, contents):
             try:
-                with files.Lock(other / ".lock", tell=lambda text: None):
+                with locks.Lock(other / ".lock", tell=lambda text: None):
                     shutil.rmtree(other, ignore_errors=True)
-            except (files.Busy, OSError):
+            except (locks.Busy, OSError):
                 continue
 
 
@@ -114,18 +114,18 @@ def _is_stale(other: Path, source: str, contents: str) -> bool:
         return False
     for mark in other.glob(f"{IN_USE}*"):
         try:
-            files.Lock(mark, tell=lambda text: None).release()
-        except (files.Busy, OSError):
+            locks.Lock(mark, tell=lambda text: None).release()
+        except (locks.Busy, OSError):
             return False
     return True
 
 
 def keep_work_folder(work: Path) -> None:
     """Keep other processes from removing a work folder while this one runs."""
-    with suppress(files.Busy, OSError):  # a read-only folder is not removed either
+    with suppress(locks.Busy, OSError):  # a read-only folder is not removed either
         mark = work / f"{IN_USE}{os.getpid()}"
-        files.hold(mark, lambda text: None)
-        atexit.register(files.release, mark)
+        locks.hold(mark, lambda text: None)
+        atexit.register(locks.release, mark)
 
 
 def user_cache() -> Path | None:

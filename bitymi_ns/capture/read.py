@@ -2,10 +2,10 @@
 
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -51,6 +51,21 @@ CONVENTIONS: dict[str, tuple[Reading, Pose]] = {
 """Conventions of formats, with the transform of their world; of others camera to world with OpenGL axes."""
 NGP_SCALE = 0.3333  # factor on positions of instant-ngp's captures, as in nerfstudio's reader
 BLENDER_SIDE = 1.5  # half the side of a Blender data set's box, as in nerfstudio's reader
+
+
+def check_options(options: Any, call: Callable[[str], str] = str) -> None:
+    """Check the options of any reader of captures that it has; `call` gives the caller's name of an option. Raises
+    CaptureError: one is out of range."""
+    mode = getattr(options, "eval_mode", None)
+    for name, used, within, what in (
+        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
+        ("downscale_factor", True, lambda value: value is None or value >= 1 and value % 1 == 0, "1 or more"),
+        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
+        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
+        ("points", isinstance(options, CaptureOptions), lambda value: value in get_args(Choice), "one of its choices"),
+    ):
+        if used and hasattr(options, name) and not within(value := getattr(options, name)):
+            fail(f"{call(name)} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
 @dataclass

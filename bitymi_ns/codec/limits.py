@@ -49,7 +49,9 @@ def beyond(name: str, kind: str, values: Tensor) -> Tensor:
         values: [N] or [N, ...].
     """
     largest = limit_of(name, kind)
-    return values.abs() > (torch.tensor(largest, device=values.device) if values.dim() > 1 else largest[0])
+    return values.abs() > (
+        torch.tensor(largest, device=values.device, dtype=torch.float32) if values.dim() > 1 else largest[0]
+    )
 
 
 def within(surfels: Mapping[str, Tensor], kind: str) -> Tensor:

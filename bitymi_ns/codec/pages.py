@@ -127,7 +127,7 @@ def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
     alphas, device = scene.alphas(), scene.tiles.device
     if alphas is None and scene.mean_alpha is None:
         return None
-    means = torch.ones(len(scene)) if scene.mean_alpha is None else scene.mean_alpha.cpu()
+    means = torch.ones(len(scene), dtype=torch.float32) if scene.mean_alpha is None else scene.mean_alpha.cpu()
     extent = torch.full_like(means, SUPPORT, device=device) if scene.extent is None else scene.extent.float()
     if alphas is None:  # no atlas: constants only
         sizes, values = torch.ones_like(scene.tiles[:, 3:]), means

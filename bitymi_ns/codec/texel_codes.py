@@ -30,9 +30,12 @@ SHRINK = 0.6  # soft threshold of an iteration relative to the step, for equally
 _ATTEMPTS = 16
 _SMALLEST_STEP, _LARGEST_STEP = 1e-5, 50.0
 # Brightness and two differences: orthonormal, so that errors keep their size.
-_OPPONENT = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]])
+_OPPONENT = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]], dtype=torch.float32)
 _OPPONENT = _OPPONENT / _OPPONENT.norm(dim=1, keepdim=True)
-_CHANNELS = {3: _OPPONENT, 1: torch.ones(1, 1)}  # transform of the channels, by their number (colours, alphas)
+_CHANNELS = {
+    3: _OPPONENT,
+    1: torch.ones(1, 1, dtype=torch.float32),
+}  # transform of the channels, by their number (colours, alphas)
 
 
 @dataclass

@@ -13,7 +13,7 @@ from torch import Tensor
 from bitymi_ns.bake.view_colors import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.codec.pages import texel_alpha
-from bitymi_ns.files import complete_folder, write_errors_as
+from bitymi_ns.files import complete_folder, reserved, write_errors_as
 from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.gaussians import Gaussians, gaussians_of, write_gaussians
@@ -88,6 +88,12 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     check_replaceable(folder, "a folder of extras", made, overwrite, BundleError, f"--overwrite{also}")
 
 
+def reserve_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
+    """Check in advance that extras can be written to a folder; raises BundleError as `write_extras`."""
+    with write_errors_as(folder, BundleError), reserved(folder, partial(check_extras, kinds, folder, overwrite)):
+        pass
+
+
 def write_extras(
     bundle: Bundle,
     folder: str | Path,
@@ -118,7 +124,7 @@ def write_extras(
             similarity; or the folder cannot be written.
     """
     folder = Path(folder)
-    check_extras(kinds, folder, overwrite)
+    reserve_extras(kinds, folder, overwrite)
     to = to_capture(bundle.info.world) if frame == "capture" else None
     note = to.note if to is not None else ""
     scene, background = bundle.scene, torch.tensor(bundle.info.render.background)

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from bitymi_ns.files import complete_folder, reserved, write_errors_as
+from bitymi_ns.files import complete_folder, write_errors_as
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, ERROR_SCALE, heat
 from bitymi_ns.measure.report.read import PICTURES
 from bitymi_ns.ops import blended_image, fragment_residual
@@ -105,25 +105,23 @@ def draw_worst(load_config: Path, output_dir: Path, views: int) -> None:
     """
     if views < 1:
         fail(f"--views must be at least 1, not {views}")
-    with write_errors_as(output_dir, InputError, "."), reserved(output_dir):
-        _check_output(output_dir)
-    config, pipeline = load_trained(load_config)
-    model, datamanager = pipeline.model, pipeline.datamanager
-    count = len(datamanager.eval_dataset)
-    if count == 0:
-        fail("the run has no held-out views to choose the worst of")
-    background = model.background
-    ranked = []
-    for index, view in enumerate(datamanager.eval_views):
-        photo = view.target(background, model.device)
-        rgb = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
-        ranked.append((image_metrics(rgb, photo, view.mask), index, view.camera, photo))
-    ranked.sort(key=lambda entry: (entry[0]["psnr"], entry[1]))
-    shown = []
     with (
         write_errors_as(output_dir, InputError, "."),
         complete_folder(output_dir, partial(_check_output, output_dir)) as new,
     ):
+        config, pipeline = load_trained(load_config)
+        model, datamanager = pipeline.model, pipeline.datamanager
+        count = len(datamanager.eval_dataset)
+        if count == 0:
+            fail("the run has no held-out views to choose the worst of")
+        background = model.background
+        ranked = []
+        for index, view in enumerate(datamanager.eval_views):
+            photo = view.target(background, model.device)
+            rgb = model.render(view.camera, background, maps=False).rgb.clamp(0.0, 1.0)
+            ranked.append((image_metrics(rgb, photo, view.mask), index, view.camera, photo))
+        ranked.sort(key=lambda entry: (entry[0]["psnr"], entry[1]))
+        shown = []
         for rank, (metrics, index, camera, photo) in enumerate(ranked[:views]):
             files = {}
             for kind, image in decompose(model.scene, camera, background, photo).items():

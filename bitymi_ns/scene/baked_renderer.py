@@ -49,8 +49,8 @@ class BakedRenderer:
         self._scene, self._surfels = compiled(scene), len(scene)
         self.images = empty_images(images, views, width, height, device)
         self.workspace = Workspace(device)
-        self._viewmats = torch.eye(4, device=device).repeat(views, 1, 1)
-        self._Ks = torch.eye(3, device=device).repeat(views, 1, 1)
+        self._viewmats = torch.eye(4, device=device, dtype=torch.float32).repeat(views, 1, 1)
+        self._Ks = torch.eye(3, device=device, dtype=torch.float32).repeat(views, 1, 1)
         self._background = None if background is None else background.to(device, torch.float32, copy=True)
         self._size = (views, width, height)
         self._use_graph, self._graph = graph, None

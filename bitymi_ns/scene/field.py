@@ -81,14 +81,14 @@ class HashField(ResidualField):
         self._moves_surfels = config.texture_moves_surfels
 
         def uniform(bound: float, *shape: int) -> nn.Parameter:
-            return nn.Parameter((torch.rand(*shape, generator=generator) * 2 - 1) * bound)
+            return nn.Parameter((torch.rand(*shape, generator=generator, dtype=torch.float32) * 2 - 1) * bound)
 
         inputs = config.levels * FEATURES
         self.field_table = uniform(1e-4, config.levels, 1 << log2_table_size, FEATURES)
         # He's rule for ReLU layers
         self.field_w1 = uniform((6 / inputs) ** 0.5, inputs, WIDTH)
         self.field_w2 = uniform((6 / WIDTH) ** 0.5, WIDTH, WIDTH)
-        self.field_w3 = nn.Parameter(torch.zeros(WIDTH, 3))
+        self.field_w3 = nn.Parameter(torch.zeros(WIDTH, 3, dtype=torch.float32))
         # a buffer, so that checkpoints contain it
         self.register_buffer("domain", torch.tensor([*mid, half, float(contract)], dtype=torch.float64))
         self._geometry: tuple[Tensor, int, FieldGeometry] | None = None

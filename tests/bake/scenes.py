@@ -37,4 +37,5 @@ def write(
     rows = torch.zeros(len(surfels["means"]), 5, dtype=torch.int32) if tiles is None else torch.from_numpy(tiles)
     of_scene = {name: options.pop(name) for name in OF_THE_SCENE if name in options}
     scene = BakedScene(surfels, kind or kind_of(surfels), rows, **of_scene)
-    return write_bundle(folder, scene, atlas, **options)
+    write_bundle(folder, scene, atlas, **options)
+    return Path(folder)

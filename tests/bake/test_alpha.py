@@ -65,7 +65,7 @@ def test_a_compact_bundle_keeps_the_alphas_that_its_colours_were_tuned_over(trai
     compact = Compact(share=0.5, views=1)
     baked = bake(scene, [camera], views, torch.zeros(3), BakeOptions(), RefineOptions(tune=tune, compact=compact))
     assert torch.equal(baked.codes.texels.alphas(), baked.alpha_codes.alphas())
-    folder = export(baked, tmp_path / "b")
+    export(baked, folder := tmp_path / "b")
     bundle, checks = check_files(folder)
     assert all(check.ok for check in checks), checks
     assert bundle.info.version == "5.0"

@@ -101,7 +101,7 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: BakeState, views
     for fill in (True, False):
         options = TuneOptions(steps=0, coded_steps=60, val_every=0)
         tuned = tune_atlas(fitted, views, BACKGROUND, options, coding=replace(coding, fill=fill))
-        bundle = export(tuned, tmp_path / f"fill-{fill}")
+        export(tuned, bundle := tmp_path / f"fill-{fill}")
         size = sum((bundle / name).stat().st_size for name in ("surfels.bin", "texels.bin"))
         assert size == tuned.codes.surfels.nbytes() + tuned.codes.texels.nbytes()
         assert (0.93 if fill else 0.5) * most < size <= most

@@ -92,4 +92,5 @@ def write_stored(name: str, folder: Path) -> Path:
 
 def write_compact(folder: Path, codes: SceneCodes, **options) -> Path:
     atlas = None if codes.texels is None else encode(*pages_of(codes), "uint8", RANGE)
-    return write_bundle(folder, scene_of(codes), atlas, codes, **options)
+    write_bundle(folder, scene_of(codes), atlas, codes, **options)
+    return Path(folder)

@@ -106,11 +106,16 @@ def test_a_manifest_that_contradicts_the_files_is_refused(surfels, tmp_path, cha
         read_bundle(tmp_path / "b")
 
 
-def test_tiles_outside_the_atlas_are_refused(surfels, tmp_path):
+def test_tiles_outside_the_atlas_are_refused(surfels, tmp_path, monkeypatch):
     params = surfels(1)
     packing = pack([[8, 8]])
     atlas = encode(np.zeros((1, 8, 8, 3), dtype=np.float32), packing, "uint8")
     bad_tiles = [[4, 0, 0, 8, 8], [0, 4, 0, 8, 8], [0, 0, 1, 8, 8], [-4, 0, 0, 8, 8], [0, 0, 0, 8, 0]]
+    for i, tile in enumerate(bad_tiles):
+        with pytest.raises(BundleError, match="was not written.*outside the atlas"):
+            write(tmp_path / str(i), params, np.array([tile], dtype=np.int32), atlas)
+        assert not list(tmp_path.iterdir())
+    monkeypatch.setattr("bitymi_ns.bundle.write.read_bundle", str)  # as a program that does not read what it wrote
     for i, tile in enumerate(bad_tiles):
         write(tmp_path / str(i), params, np.array([tile], dtype=np.int32), atlas)
         with pytest.raises(BundleError, match="outside the atlas"):

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 import torch
 
-from bitymi_ns.bundle import BundleError, check_files, check_target, read_bundle
+from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.notes import NotesError, notes_of, parse_notes
-from bitymi_ns.bundle.parts import NOTES_LIMIT
+from bitymi_ns.bundle.parts import NOTES_LIMIT, check_target
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from tests.bundle.compact_scene import make_codes, write_compact

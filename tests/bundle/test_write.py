@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle import BundleError, World, check_target, ktx2, ply, read_bundle
+from bitymi_ns.bundle import BundleError, World, ktx2, ply, read_bundle
 from bitymi_ns.bundle import write as bundle_module
+from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.ops.reference import view_color as reference
 from tests.bake.scenes import write
 from tests.bundle.damage import amend

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns import files
+from bitymi_ns import locks
 from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.known_poses import triangulate
 from bitymi_ns.capture.poses import find_poses
@@ -71,7 +71,7 @@ def test_what_is_read_from_stays(photographs: Path, kept: Callable[..., Path]) -
     second = kept(photographs)
     assert first.is_dir()
     (mark,) = first.glob(".in-use-*")
-    files.release(mark)
+    locks.release(mark)
     mark.touch()  # as a killed process leaves it
     touch(photographs, 20)
     kept(photographs)

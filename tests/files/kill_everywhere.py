@@ -100,7 +100,8 @@ def main(kind: str, folder: Path) -> None:
             killed = killed_at(step, folder, new)
             found = {name: data for name, data in contents(folder).items() if name.split("/")[0] == "b"}
             assert found in (newer, older, {}), (step, sorted(found))  # {}: nothing yet, or between two renames
-            with files.reserved(folder / "b"):  # first action of the next writer
+            check = None if kind == "file" else lambda: None
+            with files.reserved(folder / "b", check):  # first action of the next writer
                 if kind == "file":
                     files.remove_unfinished(folder)
                 settled = {k: v for k, v in contents(folder).items() if k != ".b.lock"}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bitymi_ns import files
+from bitymi_ns import files, locks
 from bitymi_ns.safe_reading import read_text
 
 WAITS = """
@@ -53,11 +53,11 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_and_nothing_else(kind: str
     assert done.stdout.count("kills") == 2
 
 
-@pytest.mark.parametrize("call", ["complete_folder(path)", "reserved(path)"])
+@pytest.mark.parametrize("call", ["complete_folder(path)", "reserved(path, lambda: None)"])
 def test_a_folder_has_one_writer_and_the_next_one_cleans_up(tmp_path: Path, call: str) -> None:
     with another_process(call, tmp_path / "b") as process:
         before = names(tmp_path)
-        with pytest.raises(files.Busy, match=f"process {process.pid} is writing there: wait for it, or end it"):
+        with pytest.raises(locks.Busy, match=f"process {process.pid} is writing there: wait for it, or end it"):
             with files.complete_folder(tmp_path / "b"):
                 pass
         assert names(tmp_path) == before and ".b.lock" in before
@@ -71,7 +71,7 @@ def test_an_unfinished_file_is_removed_when_its_process_has_ended(tmp_path: Path
     with another_process("complete_file(path)", tmp_path / "f"):
         files.remove_unfinished(tmp_path)
         assert names(tmp_path) == [".f.unfinished"]
-        with pytest.raises(files.Busy, match="another process is writing it"):
+        with pytest.raises(locks.Busy, match="another process is writing it"):
             files.write_file(tmp_path / "f", b"")
     files.remove_unfinished(tmp_path)
     assert names(tmp_path) == []
@@ -80,8 +80,8 @@ def test_an_unfinished_file_is_removed_when_its_process_has_ended(tmp_path: Path
 def test_a_lock_may_be_taken_again_by_its_thread_alone(tmp_path: Path) -> None:
     with files.reserved(tmp_path / "b") as place, files.reserved(tmp_path / "b"):
         assert names(tmp_path) == [".b.lock"]
-        with pytest.raises(files.Busy, match=f"process {os.getpid()}"):
-            files.Lock(place.with_name(".b.lock"))
+        with pytest.raises(locks.Busy, match=f"process {os.getpid()}"):
+            locks.Lock(place.with_name(".b.lock"))
     assert names(tmp_path) == []
 
 
@@ -89,7 +89,7 @@ def test_a_file_system_without_locks_costs_a_warning(tmp_path: Path, monkeypatch
     def no_locks(*arguments: object) -> None:
         raise OSError(errno.ENOLCK, "No locks available")
 
-    monkeypatch.setattr(files.fcntl, "flock", no_locks)
+    monkeypatch.setattr(locks.fcntl, "flock", no_locks)
     told: list[str] = []
     with files.complete_folder(tmp_path / "b", tell=told.append) as new:
         (new / "x").write_text("y")
@@ -131,12 +131,42 @@ def a_loop(folder: Path) -> Path:
         (lambda folder: Path("/proc/nothing/b"), "nothing can be made in /proc .*: choose another folder"),
         (lambda folder: Path("/sys/b"), "does not permit|no permission|read-only"),
         (lambda folder: Path("/proc"), "mount point"),
+        (lambda folder: folder, "it is a folder, not a file"),
     ],
 )
 def test_what_cannot_be_written_is_explained(tmp_path: Path, place: Callable[[Path], Path], why: str) -> None:
     target = place(tmp_path)
     with pytest.raises(ValueError, match=f"cannot be written: .*({why})"), files.write_errors_as(target, ValueError):
         files.check_writable(target)
+
+
+@pytest.mark.parametrize("kind", ["file", "dangling link", "link to a file"])
+def test_a_file_or_a_link_to_nothing_is_never_replaced_by_a_folder(tmp_path: Path, kind: str) -> None:
+    target = tmp_path / "thesis"
+    (tmp_path / "file").write_text("precious")
+    if kind == "file":
+        target.write_text("precious")
+    else:
+        target.symlink_to(tmp_path / ("file" if kind == "link to a file" else "nothing"))
+    before = names(tmp_path)
+    with pytest.raises(ValueError, match="thesis is not a folder|file is not a folder"):
+        with files.write_errors_as(target, ValueError), files.complete_folder(target):
+            raise AssertionError("the work has begun")
+    assert names(tmp_path) == before and (kind == "dangling link" or target.read_text() == "precious")
+
+
+def test_a_file_that_the_user_names_is_written_through_a_link_and_others_replace_it(tmp_path: Path) -> None:
+    (tmp_path / "big").mkdir()
+    for name, follow in (("named", True), ("inside", False)):
+        (tmp_path / name).symlink_to(tmp_path / "big" / name)
+        files.write_file(tmp_path / name, b"new", follow)
+        assert (tmp_path / name).is_symlink() == (tmp_path / "big" / name).is_file() == follow
+    assert names(tmp_path) == ["big", "inside", "named"] and names(tmp_path / "big") == ["named"]
+
+
+def test_an_error_elsewhere_is_not_blamed_on_the_result(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="other"), files.write_errors_as(tmp_path / "a", ValueError):
+        (tmp_path / "other").read_text()
 
 
 @pytest.fixture

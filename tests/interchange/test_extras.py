@@ -176,7 +176,10 @@ ROW = b"""{"cameras": [{"name": "a", "held_out": true, "width": 8, "height": 6, 
         (ROW % b"[1, 1, 2e9]", "correction.2"),
     ],
 )
-def test_a_damaged_list_of_cameras_is_refused(surfels, tmp_path: Path, text: bytes, message: str) -> None:
+def test_a_damaged_list_of_cameras_is_refused(
+    surfels, tmp_path: Path, text: bytes, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bitymi_ns.bundle.write.read_bundle", Path)  # as a program that does not read what it wrote
     make(surfels, tmp_path / "b", extra_files={"cameras.json": text})
     with pytest.raises(BundleError, match=message):
         read_bundle(tmp_path / "b")

@@ -106,7 +106,7 @@ class BenchRun:
         print(printable(text))
         if self.output is not None:
             with write_errors_as(self.output, BenchError):
-                write_file(self.output, text.encode("utf8"))
+                write_file(self.output, text.encode("utf8"), follow=True)
         if len(cells):
             print(printable(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}"), file=sys.stderr)
         else:

@@ -9,7 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.files import Busy, Lock, write_errors_as
+from bitymi_ns.files import write_errors_as
+from bitymi_ns.locks import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, provenance, without_nan
 from bitymi_ns.measure.bench.matrix import CellSpec, Run
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool

@@ -10,7 +10,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from bitymi_ns.files import Lock
+from bitymi_ns.locks import Lock
 from bitymi_ns.trust import no_links, printable
 
 TAIL = 25  # lines of a failed command's log to show

@@ -67,9 +67,7 @@ def to_page(content: dict[str, Any]) -> str:
 
 
 def _check_output(output_dir: Path) -> None:
-    """Refuse an output folder that is a file, or that holds a page other than a report."""
-    if output_dir.exists() and not output_dir.is_dir():
-        raise ReportError(f"{output_dir} is a file; give a folder for the report.")
+    """Refuse an output folder that holds a page other than a report."""
     page = output_dir / PAGE
     if page.exists() and GENERATOR not in _beginning(page):
         raise ReportError(f"{page} was not made by bitymi report and will not be replaced; give another folder.")
@@ -94,8 +92,8 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
     """
     output_dir = Path(os.path.expanduser(output_dir)).absolute()
     with write_errors_as(output_dir, ReportError):
+        check_writable(output_dir / PAGE)
         _check_output(output_dir)
-        check_writable(output_dir)
     text = to_page(compose(collect(list(inputs), output_dir), title))
     with write_errors_as(output_dir, ReportError):
         write_file(output_dir / PAGE, text.encode("utf8"))

@@ -140,7 +140,9 @@ def write(
 ) -> list[SceneErrors]:
     """Measure all cases and sweeps, write the page and its plot `<stem>.png`, and return the rows."""
     report_progress = progress or (lambda text: None)
-    check_writable(path)
+    picture = path.with_suffix(".png") if path.name else path
+    for target in (path, picture):
+        check_writable(target)
     named: dict[str, list[SceneErrors]] = {}
     for way in (PLAIN, *WAYS):
         named[way.name] = []
@@ -155,9 +157,8 @@ def write(
         swept[sweep.name] = [
             measure_row(f"{value:g}", sweep.make(value), backend, sweep.near(value)) for value in sweep.values
         ]
-    picture = path.with_suffix(".png")
-    write_file(picture, _plot(swept))
-    write_file(path, _page(backend, named, swept, picture.name).encode())
+    write_file(picture, _plot(swept), follow=True)
+    write_file(path, _page(backend, named, swept, picture.name).encode(), follow=True)
     return [row for rows in (*named.values(), *swept.values()) for row in rows]
 
 

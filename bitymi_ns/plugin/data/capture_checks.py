@@ -1,6 +1,5 @@
 """Check a capture before time is spent on it, and report errors of nerfstudio's loaders in plain words."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, fields
@@ -20,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 
 from bitymi_ns.capture.colmap_model import forget_model
 from bitymi_ns.capture.image_files import MAX_PIXELS
+from bitymi_ns.capture.read import check_options
 from bitymi_ns.capture.recognise import Format
 from bitymi_ns.capture.transforms import HOW_TO_GET_ONE
 from bitymi_ns.capture.types import CaptureError
@@ -81,15 +81,7 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains
     if not data.exists():
         advice = f"Give its folder with --data. {HOW_TO_GET_ONE}" if trains else MOVED
         fail(f"the capture {data} does not exist. {advice}")
-    mode = getattr(dataparser, "eval_mode", None)
-    for name, used, within, what in (
-        ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
-        ("downscale_factor", True, lambda value: value is None or value >= 1, "1 or more"),
-        ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
-        ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
-    ):
-        if used and hasattr(dataparser, name) and not within(value := getattr(dataparser, name)):
-            fail(f"--{name.replace('_', '-')} is {value}, but has to be {what}. Correct it, or leave it out.")
+    check_options(dataparser, lambda name: f"--{name.replace('_', '-')}")
     if isinstance(dataparser, BitymiDataParserConfig):
         dataparser.data = data
         if read and dataparser.find().format not in ("photographs", "video"):

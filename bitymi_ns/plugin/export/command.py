@@ -12,17 +12,17 @@ from bitymi_ns import exit_messages
 from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export, rich_progress
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
-from bitymi_ns.bundle import BundleError, read_bundle
+from bitymi_ns.bundle import BundleError, reserved_bundle
 from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.files import reason, write_file
-from bitymi_ns.interchange import Frame, Kind, check_extras, extras_folder, summary_line, write_extras
+from bitymi_ns.interchange import Frame, Kind, extras_folder, reserve_extras, summary_line, write_extras
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.summary import print_summary
-from bitymi_ns.plugin.export.target import bundle_config, bundle_version, check_room, reserve_bundle
+from bitymi_ns.plugin.export.target import bundle_config, bundle_version, check_room
 from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.scene.field import TexelField
@@ -52,8 +52,7 @@ class CompactOptions:
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if not compact and getattr(self, name) != getattr(CompactOptions, name):
                 fail(f"--{name.replace('_', '-')} is for --format compact, and this bundle's is {form}")
-        if self.target_mb is not None and not 0.01 <= self.target_mb <= 1e5:
-            fail(f"--target-mb must be from 0.01 to 100,000 MB, not {self.target_mb}")
+        self.compact_of(0)
         if self.target_psnr is not None and not 1 <= self.target_psnr <= 100:
             fail(f"--target-psnr must be from 1 to 100 dB, not {self.target_psnr}")
         if self.target_mb is not None and self.target_psnr is not None:
@@ -73,7 +72,7 @@ class CompactOptions:
         try:
             return compact if self.target_mb is None else compact.fitting(self.target_mb, beside)
         except ValueError as error:
-            fail(f"{error}; ask for more (--target-mb)", error)
+            fail(f"{error}; correct --target-mb", error)
 
 
 @dataclass(kw_only=True)
@@ -116,10 +115,10 @@ class ExportAtlas(BakeOptions, CompactOptions):
         earlier = None
         bake_options = self._options()
         try:
-            with reserve_bundle(self.output_dir, self.overwrite):
+            with reserved_bundle(self.output_dir, self.overwrite, warn):
                 earlier = bundle_version(self.output_dir)
                 if self.extras:
-                    check_extras(self.extras, extras_folder(self.output_dir), self.overwrite)
+                    reserve_extras(self.extras, extras_folder(self.output_dir), self.overwrite)
                 if self.check_room:
                     check_room(self.output_dir, self.load_config, bake_options, self.exact)
                 self._run(bake_options)
@@ -190,8 +189,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
             "loose_files": {CONFIG: bundle_config(config, self.output_dir, background)},
         }
         how = {"overwrite": self.overwrite, "interchange": self.interchange, "first": first, "background": background}
-        export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
-        bundle = read_bundle(self.output_dir)
+        bundle = export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
         if self.compare and len(datamanager.eval_dataset):
             bundle.info.statistics.held_out = compare(model, datamanager, bundle.scene)
             try:

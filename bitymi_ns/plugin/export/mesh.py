@@ -66,7 +66,7 @@ class ExportMesh(SurfaceOptions):
         except ValueError as error:
             fail(f"--{error}.", error)
         try:
-            with write_errors_as(path, InputError, " (--output-dir)."), reserved(path, warn):
+            with write_errors_as(path, InputError, " (--output-dir)."), reserved(path, tell=warn):
                 self._check_target(path)
                 bundle = bundle_at(self.load_config)
                 if bundle is None and self.crop:
@@ -94,7 +94,7 @@ class ExportMesh(SurfaceOptions):
         note = "" if to is None else to.note
         up, origin = up_of(source.world, to), torch.zeros(3) if to is None else to.origin
         self._check_target(path)
-        write_file(path, mesh_bytes(mesh, self.format, up, origin, note))
+        write_file(path, mesh_bytes(mesh, self.format, up, origin, note), follow=True)
         if self.format == "obj":  # which earlier versions wrote beside it
             path.with_suffix(".mtl").unlink(missing_ok=True)
         parts = int(mesh.parts().max()) + 1

@@ -1,8 +1,7 @@
 """Output folder of an export: checks before the work, and config.yml for nerfstudio's tools."""
 
 import copy
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +10,14 @@ import yaml
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import CONFIG as CONFIG
-from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
-from bitymi_ns.files import free_bytes, reserved, size_text, write_errors_as
-from bitymi_ns.plugin.console import InputError, fail, warn
+from bitymi_ns.files import free_bytes, size_text
+from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.plugin.run.config import method_config
 
 SURFEL_BYTES = 60 * 4  # bytes of a surfel's parameters; checkpoints have them and Adam's two moments
 TYPICAL_SIDE = 32  # side of a tile in texels, generously: within a tolerance most are far smaller
-
-
-@contextmanager
-def reserve_bundle(folder: Path, overwrite: bool) -> Iterator[None]:
-    """Lock a bundle's folder; stop if it is in use or cannot be written. Raises BundleError: other files are there."""
-    with ExitStack() as stack:
-        with write_errors_as(folder, InputError, " (--output-dir)."):
-            stack.enter_context(reserved(folder, warn))
-            check_target(folder, overwrite)
-        yield
 
 
 def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool) -> None:

@@ -54,7 +54,7 @@ def film(path: Path, fps: float) -> Iterator[Add]:
         container.mux(stream.encode(frame.reformat(format="yuv420p", **standard)))
 
     mp4: Any = {"format": "mp4", "options": {"movflags": "+faststart"}}
-    with complete_file(path) as file, av.open(os.path.abspath(file.name), "w", **mp4) as container:
+    with complete_file(path, follow=True) as file, av.open(os.path.abspath(file.name), "w", **mp4) as container:
         container.metadata["comment"] = RENDERED.decode()
         try:
             yield add
@@ -111,7 +111,7 @@ class WholeText(type(Path())):  # type: ignore[misc]
     """A path for ns-eval that writes text whole or not at all."""
 
     def write_text(self, data: str, encoding: str | None = None, *options: Any) -> int:
-        write_file(Path(self), data.encode(encoding or "utf8"))
+        write_file(Path(self), data.encode(encoding or "utf8"), follow=True)
         return len(data)
 
 

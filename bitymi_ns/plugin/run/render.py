@@ -7,6 +7,7 @@ writes. `hooks.patch_render` replaces its functions by those of this module.
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils import colormaps
 from torch import Tensor
 
-from bitymi_ns.files import check_writable, size_text, write_errors_as
+from bitymi_ns.files import reserved, size_text, write_errors_as
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
@@ -75,12 +76,9 @@ def check_options(command: Any) -> None:
     path = target_of(command)
     if as_film and path.suffix.lower() != ".mp4":
         fail(f"films are MP4: --output-path must end in .mp4, {path} does not. Frames: --output-format images.")
-    with write_errors_as(path, InputError, OPTION):
-        check_writable(path)
-    if as_film and path.is_dir():
-        fail(f"{path} is a folder: choose another --output-path.")
-    if not as_film and hasattr(command, "output_format"):
-        check_frames(path)
+    check = None if as_film else partial(check_frames, path) if hasattr(command, "output_format") else lambda: None
+    with write_errors_as(path, InputError, OPTION), reserved(path, check):
+        pass
     if hasattr(command, "camera_path_filename"):
         path = read_camera_path(Path(command.camera_path_filename))
         if as_film and not RATES[0] <= path.rate <= RATES[1]:

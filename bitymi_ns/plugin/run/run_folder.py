@@ -4,7 +4,7 @@ import atexit
 import shutil
 from pathlib import Path
 
-from bitymi_ns import files
+from bitymi_ns import files, locks
 from bitymi_ns.capture.colmap_views import Source
 from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.sfm_poses import write_kept_poses
@@ -21,8 +21,8 @@ def take(folder: Path) -> None:
     with files.write_errors_as(folder, InputError, " (--output-dir)."):
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            files.hold(folder / LOCK, warn)
-        except files.Busy as error:
+            locks.hold(folder / LOCK, warn)
+        except locks.Busy as error:
             other = "give another --timestamp, --experiment-name or --output-dir"
             fail(f"{folder} is in use: {error}. Or train into another folder: {other}.", error)
     atexit.register(leave, folder)
@@ -41,7 +41,7 @@ def check_unused(folder: Path, checkpoints: Path) -> None:
 
 def leave(folder: Path) -> None:
     """Let other processes train into the folder."""
-    files.release(folder / LOCK)
+    locks.release(folder / LOCK)
 
 
 def keep_poses_report(folder: Path, report: Path | None, source: Source | None = None) -> None:

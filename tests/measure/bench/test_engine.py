@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.cli import main
-from bitymi_ns.files import Lock
+from bitymi_ns.locks import Lock
 from bitymi_ns.measure.bench import engine
 from bitymi_ns.measure.bench.cells import Cells, identity
 from bitymi_ns.measure.bench.engine import run_chains, time_left

@@ -145,7 +145,7 @@ def test_foreign_page_is_not_replaced(eval_json, tmp_path: Path) -> None:
     with pytest.raises(ReportError, match="will not be replaced"):
         build([eval_json(psnr=20.0)], tmp_path / "site")
     (tmp_path / "file").write_text("x")
-    with pytest.raises(ReportError, match="is a file"):
+    with pytest.raises(ReportError, match="file is not a folder: choose another path"):
         build([eval_json(psnr=20.0)], tmp_path / "file")
 
 

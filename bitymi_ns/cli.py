@@ -235,7 +235,7 @@ class Unpack:
         from bitymi_ns.plugin.export.target import CONFIG, config_without_run
 
         folder = self.output or self.bundle.with_name(self.bundle.name.removesuffix(SUFFIX))
-        config = config_without_run(folder, read_manifest(self.bundle).render.background)
+        config = config_without_run(folder, read_manifest(self.bundle))
         with write_errors_as(folder, ValueError):
             _say_left_out(write_folder(self.bundle, folder, {CONFIG: config}))
         say(f"Wrote {folder}: give {folder / CONFIG} to nerfstudio's commands.")

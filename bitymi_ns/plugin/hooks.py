@@ -29,7 +29,7 @@ from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataparser import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.views import DATA
 from bitymi_ns.plugin.run import checkpoints, render
-from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
+from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, check_same_capture
 from bitymi_ns.plugin.run.films import WholeText, open_gzip, write_image
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
 
@@ -156,7 +156,10 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
             datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data))
             datamanager.data = model.bundle
         if evaluated is not None:  # no pickled data may lie in a bundle
-            hand_over(config, model.bundle / MANIFEST, {"step": 0, "pipeline": {}})
+            found = _running_command()
+            measured = found is not None and type(found[0]).__name__ == "ComputePSNR"
+            check = partial(check_same_capture, model.bundle) if measured else None
+            hand_over(config, model.bundle / MANIFEST, {"step": 0, "pipeline": {}}, check)
         return model.bundle
     folder = usual()
     if evaluated is not None:
@@ -171,8 +174,8 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     return folder
 
 
-def hand_over(ours: Any, path: Path, state: dict[str, Any]) -> None:
-    """Have eval_setup load `state`, read from `path`, for the configuration `ours`.
+def hand_over(ours: Any, path: Path, state: dict[str, Any], check: Callable[[Any], None] | None = None) -> None:
+    """Have eval_setup load `state`, read from `path`, for the configuration `ours`, and `check` the pipeline.
 
     Changes: `eval_load_checkpoint` in nerfstudio's eval_utils, once. For: ns-eval, ns-render, ns-viewer, ns-export.
     Without: nerfstudio reads the file again by torch.load, which can run code of others, and no bundle opens.
@@ -187,6 +190,8 @@ def hand_over(ours: Any, path: Path, state: dict[str, Any]) -> None:
             return stock(config, pipeline)
         eval_utils.eval_load_checkpoint = stock
         pipeline.load_pipeline(state["pipeline"], state["step"])
+        if check is not None:
+            check(pipeline)
         return path, state["step"]
 
     eval_utils.eval_load_checkpoint = load

@@ -17,10 +17,13 @@ from nerfstudio.scripts.viewer import run_viewer
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
+import bitymi_ns
+from bitymi_ns import cli
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.hooks import REFUSED
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.sample import generate
 from tests.e2e.exports import evaluate
 from tests.e2e.runs import a_run_of, rewrite
 
@@ -90,6 +93,29 @@ def test_what_needs_photographs_says_how_to_name_them(
     monkeypatch.setenv("BITYMI_DATA", str(tmp_path / "nowhere"))
     with pytest.raises(InputError, match="BITYMI_DATA names .*nowhere as the capture, which does not exist"):
         eval_setup(alone / "config.yml")
+
+
+def test_a_bundle_is_compared_with_its_own_capture_alone(
+    bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any other has cameras elsewhere, as has the same one in another frame."""
+    other = generate(tmp_path / "other", views=8, width=48, height=36, seed=1)
+    monkeypatch.setenv("BITYMI_DATA", str(other))
+    rewrite(copy := Path(shutil.copytree(bundle, tmp_path / "copy")), lambda config: None)
+    with pytest.raises(InputError, match=r"copy is not of the capture .*other, or of its frame: half of its cameras"):
+        evaluate(copy / "config.yml", tmp_path / "out.json")
+
+
+def test_a_bundle_without_run_is_in_the_frame_of_its_captures_files(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    views, points, colors = bitymi_ns.load_capture(room)
+    scene, log = bitymi_ns.train_scene(views, points, colors, steps=60, eval_views=views[:2])
+    bitymi_ns.bake_scene(scene, views, tmp_path / "b")
+    assert cli.main(["unpack", str(tmp_path / "b"), "--output", str(tmp_path / "c")]) == 0
+    monkeypatch.setenv("BITYMI_DATA", str(room))
+    found = evaluate(tmp_path / "c" / "config.yml", tmp_path / "out.json")
+    assert found["psnr"] == pytest.approx(log.entries[-1].psnr, abs=2.5)
 
 
 def test_a_run_whose_capture_was_moved(

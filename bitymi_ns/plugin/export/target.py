@@ -5,10 +5,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.bundle.manifest import MANIFEST
+from bitymi_ns.bundle.manifest import MANIFEST, Manifest
 from bitymi_ns.bundle.parts import CONFIG as CONFIG
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import free_bytes, size_text
@@ -63,9 +64,13 @@ def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> byt
     return yaml.dump(config).encode("utf8")
 
 
-def config_without_run(folder: Path, background: Sequence[float]) -> bytes:
-    """Make the config.yml of a bundle without run, which uses its own cameras; `BITYMI_DATA` names a capture."""
+def config_without_run(folder: Path, info: Manifest) -> bytes:
+    """Make the config.yml of a bundle without run, which uses its own cameras; `BITYMI_DATA` names a capture, which is
+    read in the frame of its files if that is the bundle's."""
     config = method_config("bitymi").config
     config.experiment_name = folder.name
     config.pipeline.datamanager.data = folder.absolute() / "photographs"
-    return bundle_config(config, folder, background)
+    if info.world is None or (np.array_equal(info.world.transform, np.eye(4)[:3]) and info.world.scale == 1):
+        own = {"orientation_method": "none", "center_method": "none", "auto_scale_poses": False}
+        vars(config.pipeline.datamanager.dataparser).update(own)
+    return bundle_config(config, folder, info.render.background)

@@ -15,9 +15,11 @@ from torch import Tensor
 
 from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
 from bitymi_ns.bundle.notes import NotesError
-from bitymi_ns.bundle.read import download_bytes
+from bitymi_ns.bundle.read import download_bytes, read_cameras
 from bitymi_ns.ops import webgpu
 from bitymi_ns.plugin.console import fail
+from bitymi_ns.plugin.data.cameras import to_cameras
+from bitymi_ns.plugin.data.views import DATA
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig, box_of
 from bitymi_ns.scene.baked import FAST, BakedOutput
@@ -116,6 +118,28 @@ class BakedModel(SurfelModel):
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
         """Load nothing: all is in the bundle."""
         return torch.nn.modules.module._IncompatibleKeys([], [])
+
+
+def check_same_capture(bundle: Path, pipeline: Any) -> None:
+    """Check before a comparison that a bundle is of the capture that a pipeline has read, in the same frame: half of
+    its cameras need one of the capture's within 5 % of their extent and 5 degrees. Raises InputError: it is not."""
+    stated = [row.camera for row in read_cameras(bundle)]
+    if not stated:
+        return
+    data = pipeline.datamanager
+    found = to_cameras(data.train_dataset.cameras, "cpu") + to_cameras(data.eval_dataset.cameras, "cpu")
+    theirs, ours = (torch.stack([camera.viewmat.double() for camera in some]) for some in (stated, found))
+    centers = [torch.linalg.inv(some)[:, :3, 3] for some in (theirs, ours)]
+    extent = (centers[0] - centers[0].mean(0)).norm(dim=1).max().clamp(min=1e-9)
+    apart, nearest = (torch.cdist(*centers) / extent).min(1)
+    traces = (theirs[:, :3, :3] * ours[nearest, :3, :3]).sum((1, 2))
+    turned = torch.rad2deg(torch.acos((0.5 * (traces - 1)).clamp(-1, 1)))
+    if apart.median() > 0.05 or turned.median() > 5:
+        fail(
+            f"{bundle} is not of the capture {data.config.data}, or of its frame: half of its cameras are more than "
+            f"{float(apart.median()):.0%} of their extent, or {float(turned.median()):.0f} degrees, from any of the "
+            f"capture's. Name its own: `{DATA}=/where/it/is`."
+        )
 
 
 @contextmanager

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.measure.report.read import SIDE_BY_SIDE
-from bitymi_ns.measure.report.records import is_bundle_name
 from bitymi_ns.safe_reading import open_regular
 
 ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
@@ -130,7 +129,7 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
     if len(groups) > MAX_SETS:
         notes.append(f"Views of {len(groups) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
     names = _titles(list(folders))
-    ordered = [sorted(g, key=lambda f: (is_bundle_name(names[f]), names[f])) for g in groups.values()]
+    ordered = [sorted(g, key=names.__getitem__) for g in groups.values()]
     return [view for group in ordered[:MAX_SETS] for view in _compared(group, folders, names, len(ordered) > 1)]
 
 

@@ -9,7 +9,6 @@ from typing import Any
 from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.trust import finite_numbers
 
-_BUNDLE = re.compile(r"(?<![a-z])(bundle|baked)(?![a-z])")
 _BUNDLE_SUFFIX = re.compile(r"[-_]?(bundle|baked)$")
 _FORMAT = re.compile(r"(?<![a-z0-9])(fp16|uint8|bc7|compact)(?![a-z0-9])")
 
@@ -73,20 +72,14 @@ class Records:
     notes: list[str] = field(default_factory=list)
 
 
-def is_bundle_name(name: str) -> bool:
-    """Return True if the name of a method, folder or path contains "bundle" or "baked"."""
-    return _BUNDLE.search(name.lower()) is not None
-
-
 def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
     """Build an evaluation from ns-eval's JSON object."""
     results = finite_numbers(data["results"])
     checkpoint = str(data.get("checkpoint") or "")
     name = str(data.get("method_name") or "unnamed method")
-    # only the tail .../<folder>/<folder>/nerfstudio_models/step-*.ckpt: a data set's name must not match
     parts = Path(checkpoint.replace("\\", "/")).parts
     tail = "/".join(parts[-2 if parts[-1:] == (MANIFEST,) else -4 :]).lower()
-    baked = results.get("atlas_bytes", 0.0) > 0 or is_bundle_name(name) or is_bundle_name(tail)
+    baked = "bundle_bytes" in results or results.get("atlas_bytes", 0.0) > 0  # which earlier versions stated alone
     method = (_BUNDLE_SUFFIX.sub("", name) or name) if baked else name
     form = _FORMAT.search(tail) or _FORMAT.search(f"{source.parent.name}/{source.stem}".lower())
     label = f"{method}, {form[1]}" if baked and form else method

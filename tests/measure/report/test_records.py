@@ -25,28 +25,13 @@ def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("method", "checkpoint", "atlas_bytes", "baked"),
-    [
-        ("bitymi", "/o/fox/bitymi/2025/nerfstudio_models/step-1.ckpt", 0, False),
-        ("bitymi", "/o/fox/bitymi/2025/nerfstudio_models/step-1.ckpt", 4096, True),
-        ("bitymi-bundle", "", 0, True),
-        ("bitymi", "/demo/bundle/nerfstudio_models/step-000000000.ckpt", 0, True),
-        ("bitymi", "C:\\demo\\bundle\\nerfstudio_models\\step-0.ckpt", 0, True),
-        # "bundle" is in the dataset's name, not the run's
-        ("bitymi", "/bundle/outputs/fox/bitymi/2025/nerfstudio_models/step-1.ckpt", 0, False),
-        ("bitymi", "/data/bundler/2025/nerfstudio_models/step-1.ckpt", 0, False),
-    ],
+    ("results", "baked"),
+    [({}, False), ({"atlas_bytes": 0}, False), ({"atlas_bytes": 4096}, True), ({"bundle_bytes": 9}, True)],
 )
-def test_baked_or_trained(method: str, checkpoint: str, atlas_bytes: int, baked: bool):
-    row = make(method=method, checkpoint=checkpoint, atlas_bytes=atlas_bytes, psnr=20.0)
-    assert row.baked is baked
-    assert row.method == "bitymi"
-
-
-def test_export_without_texture_is_known_by_its_stand_in_for_a_checkpoint(tmp_path):
-    checkpoint = str(tmp_path / "bitymi-bundle-x7/room/nerfstudio_models/step-000000000.ckpt")
-    assert make(method="bitymi-notexture", checkpoint=checkpoint, atlas_bytes=0).baked
-    assert not make(checkpoint="nul\0/a/b").baked
+@pytest.mark.parametrize("method", ["bitymi", "half-baked", "bundle"])
+def test_a_bundle_states_its_bytes_and_a_run_has_none(method: str, results: dict[str, float], baked: bool) -> None:
+    checkpoint = "/half-baked/bundle/nerfstudio_models/step-1.ckpt"
+    assert make(method=method, checkpoint=checkpoint, psnr=20.0, **results).baked is baked
 
 
 def test_label_of_a_bundle_names_its_format():

@@ -32,11 +32,11 @@ def test_worst_median_and_best_of_trained_scene_and_bundle_side_by_side(tmp_path
     for view in views:
         photograph, *renders = [[picture.caption for picture in column] for column in view.columns]
         assert photograph == ["photograph"]
-        assert [error for _, error in renders] == ["error of trained", "error of baked"]
+        assert [error for _, error in renders] == ["error of baked", "error of trained"]
         assert all((p.width, p.height) == (8, 6) for column in view.columns for p in column)
     # 8-bit errors of 12 and 2 steps
     best = [column[0].caption for column in views[2].columns]
-    assert best == ["photograph", "trained: 26.55 dB", "baked: 42.11 dB"]
+    assert best == ["photograph", "baked: 42.11 dB", "trained: 26.55 dB"]
     html = page_of(views=views)
     assert html.count("<figure>") == 15 and html.count('<div class="views">') == 3
 

@@ -46,7 +46,8 @@ def reason(error: OSError, path: Path) -> str:
     if error.errno in (errno.ENOTDIR, errno.EEXIST, errno.ENOENT):
         there = _nearest(path.absolute())
         if not there.is_dir():
-            return f"{there} is not a folder: choose another path"
+            what = "a link to nothing" if there.is_symlink() and not there.exists() else "not a folder"
+            return f"{there} is {what}: choose another path"
         return f"nothing can be made in {there} ({error.strerror}): choose another folder"
     return _REASONS.get(error.errno or 0) or error.strerror or str(error)
 

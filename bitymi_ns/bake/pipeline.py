@@ -25,6 +25,7 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import View
+from bitymi_ns.trust import listed
 
 
 @torch.no_grad()
@@ -135,8 +136,12 @@ def bake(
         held_out: views of which the gains are stated; they decide nothing.
 
     Raises:
-        ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
+        ValueError: no surfel is left, an option is out of range or for a field alone, or the atlas would be too large.
     """
+    of_fields = ("r_min", "r_max", "extent", "local_voxel")
+    given = [name for name in of_fields if getattr(options, name) != getattr(BakeOptions, name)]
+    if given and isinstance(scene.field, TexelField):
+        raise ValueError(f"{listed(given)} are for a field: tiles that were trained get smaller by the tolerance")
     tune, coding, device = refine.tune, None, device_of(cameras)
     form = "compact" if refine.compact is not None else options.format
     options = replace(options, format=replace(options, format=form).texel_format)  # as bundle.json states it

@@ -260,15 +260,15 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
 
 
 @contextmanager
-def reserved_bundle(folder: str | Path, overwrite: bool, tell: Tell = warnings.warn) -> Iterator[None]:
-    """Lock the folder of a bundle for the block, before the work of baking it.
+def reserved_bundle(folder: str | Path, overwrite: bool, tell: Tell = warnings.warn, then: str = "") -> Iterator[None]:
+    """Lock the folder of a bundle for the block, before the work of baking it; `then` ends the message of an error.
 
     Raises:
         BundleError: as `check_target`, or the folder is in use or cannot be written.
     """
     folder = Path(folder)
     with ExitStack() as stack:
-        with write_errors_as(folder, BundleError):
+        with write_errors_as(folder, BundleError, then):
             stack.enter_context(reserved(folder, lambda: check_target(folder, overwrite), tell))
         yield
 

@@ -127,6 +127,7 @@ def generate(
     Raises:
         ValueError: an argument is too small.
         FileExistsError: the folder already holds files that are not a sample, or `overwrite` is False.
+        NotADirectoryError: it is a file.
     """
     limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
     for name, (value, least) in limits.items():

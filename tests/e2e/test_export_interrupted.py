@@ -23,7 +23,7 @@ def interrupted(*args: Any, **kwargs: Any) -> None:
         (tuning_views, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
         (bake_pipeline, "trained_texels", {}, False, "was not written"),
         (bake_pipeline, "trained_texels", {"overwrite": True}, True, "is the earlier one"),
-        (command, "read_bundle", {"finetune_steps": 0}, False, "is complete"),
+        (command, "compare", {"finetune_steps": 0}, False, "is complete"),
     ],
     ids=["fine-tuning", "bake", "bake of a replacement", "comparison"],
 )
@@ -78,7 +78,7 @@ def test_ctrl_c_while_a_bundle_is_replaced_says_which_one_is_there(
 
     monkeypatch.setattr(Path, call, interrupted_after)
     with pytest.raises(SystemExit):
-        run_export(trained, copied, overwrite=True, r_max=8, compare=False, finetune_steps=0)
+        run_export(trained, copied, overwrite=True, tolerance=2.0, compare=False, finetune_steps=0)
     monkeypatch.undo()
     assert state in " ".join(capsys.readouterr().out.split())
     assert ((copied / "bundle.json").read_bytes() == before) == (state == "is the earlier one")

@@ -23,9 +23,9 @@ def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerCo
     with pytest.raises(InputError, match="is there already.*--overwrite True"):
         run_export(trained, copied)
     assert (copied / "bundle.json").read_bytes() == before
-    run_export(trained, copied, overwrite=True, r_max=8, compare=False, finetune_steps=0)
+    run_export(trained, copied, overwrite=True, tolerance=2.0, compare=False, finetune_steps=0)
     info = json.loads((copied / "bundle.json").read_text())
-    assert info["statistics"]["options"]["r_max"] == 8 and "held_out" not in info["statistics"]
+    assert info["statistics"]["options"]["tolerance"] == 2 and "held_out" not in info["statistics"]
 
 
 def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
@@ -61,6 +61,13 @@ def test_options_out_of_range_are_found_before_the_work(
     monkeypatch.setattr(command, "load_trained", None)  # not called
     with pytest.raises(InputError, match=message):
         run_export(trained, tmp_path / "b", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_options_of_fields_are_refused_for_trained_texels(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+    for options in ({"r_max": 16}, {"extent": 1.5}, {"r_min": 8, "local_voxel": False}):
+        with pytest.raises(InputError, match=f"cannot be baked: .*{next(iter(options))}.* for a field.*tolerance"):
+            run_export(trained, tmp_path / "b", **options)
     assert list(tmp_path.iterdir()) == []
 
 

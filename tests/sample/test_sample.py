@@ -136,7 +136,7 @@ def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
         generate(tmp_path, views=1)
-    with pytest.raises(FileExistsError, match="is not a folder"):
+    with pytest.raises(NotADirectoryError):
         generate(tmp_path / "mine.txt", views=1)
     with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
         generate(tmp_path, views=1, width=16, height=12, overwrite=True)

@@ -115,7 +115,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         earlier = None
         bake_options = self._options()
         try:
-            with reserved_bundle(self.output_dir, self.overwrite, warn):
+            with reserved_bundle(self.output_dir, self.overwrite, warn, " (--output-dir)"):
                 earlier = bundle_version(self.output_dir)
                 if self.extras:
                     reserve_extras(self.extras, extras_folder(self.output_dir), self.overwrite)

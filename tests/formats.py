@@ -65,11 +65,12 @@ def polycam(capture: Path, corrected: bool = True) -> Path:
             here = Y_UP @ pose
             here[0, 3] += 0.0 if kind or not corrected else 0.3 * i  # the raw poses drift
             values = {f"t_{r}{c}": here[r, c] for r in range(3) for c in range(4)}
-            camera = {"fx": meta["fl_x"], "fy": meta["fl_y"], "cx": meta["cx"], "cy": meta["cy"], "width": meta["w"]}
+            camera = {"fx": meta["fl_x"], "fy": meta["fl_y"], "cx": meta["cx"], "cy": meta["cy"]}
+            camera |= {} if kind else {"width": meta["w"], "height": meta["h"]}  # corrected ones have none since 2025
             put(file, folder / f"keyframes/{kind}images/{i}.png")
             place = folder / f"keyframes/{kind}cameras/{i}.json"
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.write_text(json.dumps({**values, **camera, "height": meta["h"], "blur_score": 1.0}))
+            place.write_text(json.dumps({**values, **camera, "blur_score": 1.0}))
             put_depth(folder / f"keyframes/depth/{i}.png")
     put(frames[0][0], folder / "thumbnail.png")
     return folder
@@ -114,6 +115,18 @@ def seven_scenes(capture: Path) -> Path:
         put(file, folder / f"frame-{i:06d}.depth.png")
         np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose @ np.diag([1, -1, -1, 1]))
     (folder / "intrinsics.txt").write_text(f"{meta['fl_x']} {meta['fl_y']} {meta['cx']} {meta['cy']}\n")
+    return folder
+
+
+def nsvf(capture: Path) -> Path:
+    """NSVF: the first numbers of names are of training, validation and test; f, cx, cy begin the file of the camera."""
+    frames, meta, folder = room_of(capture)
+    (folder / "pose").mkdir()
+    for i, (file, pose) in enumerate(frames):
+        name = f"{max(0, i - 9)}_{i:04d}"
+        put(file, folder / f"rgb/{name}.png")
+        np.savetxt(folder / f"pose/{name}.txt", pose @ np.diag([1, -1, -1, 1]))
+    (folder / "intrinsics.txt").write_text(f"{meta['fl_x']} {meta['cx']} {meta['cy']} 0.\n0. 0. 0.\n0.\n1.\n36 48\n")
     return folder
 
 

@@ -20,7 +20,7 @@ from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.points import color_bytes, read_cloud
 from bitymi_ns.capture.recognise import image_count
 from bitymi_ns.capture.transforms import MAX_SIDE
-from bitymi_ns.capture.types import ColmapCamera, fail, parsing, warn
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, fail, parsing, warn
 from bitymi_ns.safe_reading import open_text, read_bytes
 from bitymi_ns.trust import listed
 
@@ -84,7 +84,7 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
             first = f"the first is point {np.argmin(finite) + 1}"
             warn(f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, {first}, are not finite. They are left out.")
             xyz, rgb = xyz[finite], rgb[finite] if len(rgb) else rgb
-    elif (cloud := folder / "points3D.ply").is_file():  # written by programs that have read the model
+    if not len(xyz) and (cloud := folder / "points3D.ply").is_file():  # by programs that read or made the model
         (xyz, rgb), without_colors = read_cloud(cloud, "Copy it again, or move it away to have points triangulated.")
     # nerfstudio sorts paths, not text: sort alike to hold the same photographs out
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
@@ -302,6 +302,8 @@ def _lines(path: Path) -> Iterator[str]:
 def _cameras_text(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
     for line in filter(None, _lines(path)):
         number, model, width, height, *params = line.split()
+        if model == "SPHERE":  # SphereSfM's name
+            model, params = SPHERICAL_MODEL, [width, height]
         if parameter_count(model) is None:
             raise ValueError(f"COLMAP has no camera model {model}")
         yield int(number), ColmapCamera(model, int(width), int(height), tuple(map(float, params)))
@@ -351,7 +353,7 @@ def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.ui
     counts = {len(row) for row in rows}
     if not counts <= {3, 6} or len(counts) > 1:
         raise ValueError("a point has a number, three coordinates and three colors")
-    values = np.array(rows).reshape(len(rows), -1)
-    if values.shape[1] < 6:
-        return values[:, :3].reshape(-1, 3), np.zeros((0, 3), np.uint8), "its points have none" * bool(rows)
+    if 6 not in counts:
+        return np.array(rows).reshape(-1, 3), np.zeros((0, 3), np.uint8), "its points have none" * bool(rows)
+    values = np.array(rows)
     return values[:, :3], *color_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))

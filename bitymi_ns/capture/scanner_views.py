@@ -82,7 +82,7 @@ def _polycam(folder: Path) -> list[ScannedPhotograph]:
             values = read_json(path)
             pose = np.eye(4)
             pose[:3] = [[float(values[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
-            size = (int(values["width"]), int(values["height"]))
+            size = (int(values["width"]), int(values["height"])) if "width" in values else None  # since late in 2025
             pinhole = tuple(float(values[name]) for name in ("fx", "fy", "cx", "cy"))
         pictures = [*filter(is_photograph, images.glob(f"{path.stem}.*")), images / f"{path.stem}.jpg"]
         rows.append(ScannedPhotograph(pictures[0], Y_UP @ pose, pinhole, size))
@@ -175,7 +175,8 @@ def _pose_files(folder: Path) -> list[ScannedPhotograph]:
 
 
 def _intrinsics(folder: Path) -> tuple[float, ...]:
-    """Read fx, fy, cx, cy of all photographs from the first known file name: a matrix, or four numbers."""
+    """Read fx, fy, cx, cy of all photographs from the first known file name: a matrix, also in one line; four numbers;
+    or NSVF's, whose first line is f, cx and cy."""
     names = ("intrinsic/intrinsic_color.txt", "intrinsics_color.txt", "intrinsic_color.txt", "intrinsics.txt",
              "intrinsic.txt", "camera-intrinsics.txt", "calibration.txt", "../camera-intrinsics.txt")  # fmt: skip
     path = next((folder / name for name in names if (folder / name).is_file()), None)
@@ -185,10 +186,13 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
             "fx 0 cx, 0 fy cy, 0 0 1, a row on each line; or compute the poses: `bitymi-data --format photographs`."
         )
     with parsing(path, AGAIN):
-        values = np.loadtxt(StringIO(read_text(path, MOST_POSE)))
-        if values.ndim == 2 and min(values.shape) >= 3:
-            return float(values[0, 0]), float(values[1, 1]), float(values[0, 2]), float(values[1, 2])
-        fx, fy, cx, cy = values.ravel()[:4].tolist()
+        rows = [[float(word) for word in line.split()] for line in read_text(path, MOST_POSE).splitlines()]
+        first, *more = filter(None, rows)
+        if not more and len(first) in (9, 16):
+            first, *more = np.reshape(first, (3 if len(first) == 9 else 4, -1)).tolist()
+        if more and min(len(first), len(more[0])) >= 3 and more[0][1]:
+            return first[0], more[0][1], first[2], more[0][2]
+        fx, fy, cx, cy = first if len(first) == 4 and first[3] else (first[0], *first[:3])
         return fx, fy, cx, cy
 
 

@@ -31,7 +31,7 @@ from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, f
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import listed
 
-HOW_TO_GET_ONE = "Make one from photographs with `ns-process-data images --data <photos> --output-dir <capture>`."
+HOW_TO_GET_ONE = "Make one from photographs or a video: `bitymi sfm PHOTOGRAPHS --output CAPTURE`."
 HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write it again."
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")
@@ -49,8 +49,7 @@ COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
 FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
 """Entries of a focal length: in pixels, or by the view angle in radians, or in degrees."""
-STATED_BY = {"fl_x": FOCALS["x"], "fl_y": (*FOCALS["y"], *FOCALS["x"][1:])}
-"""Entries that may stand for another; an angle of one side assumes square pixels."""
+OF_MATRIX = {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # rows and columns of a camera matrix
 EQUAL_AREA = ("equirectangular", "is_equirectangular")  # instant-ngp's entries for 360-degree rows of equal areas
 USED = {
     "frames", *FILE_KEYS, "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",
@@ -126,16 +125,17 @@ def read_transforms(
 
 def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
     """Load a file in any Unicode encoding, with or without byte order mark; check its frames, poses and lists of names,
-    and make poses rotations. nerfstudio's own format states each camera in full. Raises CaptureError: the file cannot
-    be used; names the frame."""
+    and make poses rotations. Raises CaptureError: the file cannot be used; names the frame."""
     if not os.path.lexists(path):
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
     with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
         meta = read_json(path)
         _drop_nulls(meta)
         _check_frames(path, meta, own_format)
-        if own_format:
-            _check_intrinsics(path, meta)
+        for holder in (meta, *meta["frames"]):
+            matrix = holder.pop("intrinsic_matrix", None)  # of NeuS2
+            for key, (i, j) in OF_MATRIX.items() if matrix else ():
+                holder.setdefault(key, matrix[i][j])
         _check_applied(path, meta)
         _check_lists(path, meta)
         correct_poses(path, meta["frames"])
@@ -177,18 +177,6 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
     if 0 < len(without) < len(frames):
         advice = "Give every frame a mask (a white picture lets all pixels count), or none."
         fail(f"{path}: no mask_path for {listed(without)}, but other frames have one. {advice}")
-
-
-def _check_intrinsics(path: Path, meta: dict[str, Any]) -> None:
-    """Fail if neither a frame nor the file states an entry of nerfstudio's cameras."""
-    frames = meta["frames"]
-    for key in INTRINSICS:
-        keys = STATED_BY.get(key, (key,))
-        lacking = [frame["file_path"] for frame in frames if not any(key in meta or key in frame for key in keys)
-                   and (key in ("w", "h") or not is_equirectangular(meta, frame))]  # fmt: skip
-        if lacking:
-            add = f"Add it once at the top of the file{'' if len(lacking) == len(frames) else ', or to each frame'}"
-            fail(f"{path} gives no {key} for {listed(lacking)}: it is neither in the frame nor at the top. {add}.")
 
 
 def is_equirectangular(meta: dict[str, Any], frame: dict[str, Any]) -> bool:

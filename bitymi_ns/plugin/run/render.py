@@ -163,10 +163,11 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds
     cameras.rescale_output_resolution(1.0 / command.downscale_factor)
     views = [to_camera(cameras[i : i + 1], model.device) for i in range(len(cameras))]
     width, height = views[0].width * len(names), views[0].height
-    if not images and (width % 2 or height % 2):
-        say(f"H.264 needs even sizes: of {width} x {height} pixels the last row or column is left out.")
     if not images and min(width, height) < 2:
         fail(f"a film of {width} x {height} pixels cannot be written: give a smaller --downscale-factor.")
+    if not images and (width % 2 or height % 2):
+        say(f"H.264 needs even sizes: of {width} x {height} pixels the last row or column is left out.")
+        width, height = width // 2 * 2, height // 2 * 2
     planes = _depth_planes(model, views, command) if "depth" in names else {}
     empty = 0
     try:

@@ -40,6 +40,11 @@ def test_images_without_their_second_line(project: Path, name: str) -> None:
     assert [image.name for image in read_model(path.parent).images] == [name.format(words[9]) for words in lines]
 
 
+def test_spheres_of_sphere_sfm(project: Path) -> None:
+    (project / "sparse/0/cameras.txt").write_text("1 SPHERE 48 24 1.0 24 12\n")
+    assert read_model(project / "sparse/0").cameras == {1: ("EQUIRECTANGULAR", 48, 24, (48.0, 24.0))}
+
+
 @pytest.mark.parametrize(
     ("colours", "expected"),
     [

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from bitymi_ns.capture.depth_normal_maps import read_depth
+from bitymi_ns.capture.scanner_views import _intrinsics
 from tests.capture.test_video import overwrite_packets
 from tests.captures import load_any, printed
 from tests.formats import SCANS, scanner_app, scannet, seven_scenes, stray_scanner
@@ -43,6 +44,17 @@ def test_scans_are_read_with_their_poses(
         assert other.metadata["maps"][1].confidence.name == "conf_00005.png"
     assert "12 photographs with their poses" in (text := printed(capsys))
     assert "depth maps" in text or "depth map" in text
+
+
+def test_cameras_of_folders_with_poses(tmp_path: Path) -> None:
+    matrix = np.array([[40, 0, 24, 0], [0, 41, 18, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    for numbers, fy in (
+        (matrix, 41), (matrix[:3, :3], 41), (matrix[:2], 41), (matrix.reshape(1, 16), 41),
+        (matrix[:3, :3].reshape(1, 9), 41), ([[40, 41, 24, 18]], 41), ([[40, 24, 18]], 40), ([[40, 24, 18, 0]], 40),
+        ([[40, 24, 18, 0], [0, 0, 0], [0], [1], [36, 48]], 40), ([[40, 24, 18], [0, 0, 0], [0.5]], 40),
+    ):  # fmt: skip
+        (tmp_path / "intrinsics.txt").write_text("\n".join(" ".join(map(str, row)) for row in numbers))
+        assert _intrinsics(tmp_path) == (40, fy, 24, 18)
 
 
 def test_a_pose_that_was_lost(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

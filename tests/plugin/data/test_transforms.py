@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from PIL import Image
 
@@ -67,6 +68,21 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path) -> None:
     assert float(train.cameras.fy[index]) == 81.0 and float(train.cameras.fy[index - 1]) != 81.0
     assert [lens.distorts for lens in train.metadata["lenses"][index - 1 : index + 1]] == [False, True]
     assert len(manager.cached_train) == 10
+
+
+def test_a_camera_matrix_and_the_size_of_the_picture(capture: Path) -> None:
+    """NeuS2's matrices of 4 x 4; whatever a file leaves out is that of the picture, its middle, or of square pixels."""
+    before = load(capture).train_dataset.cameras
+
+    def change(meta: dict[str, Any]) -> None:
+        fx, cy, *_ = (meta.pop(key) for key in ("fl_x", "cy", "fl_y", "cx", "w", "h"))
+        for i, frame in enumerate(meta["frames"]):
+            frame.update({"intrinsic_matrix": [[fx, 0, 24], [0, fx, cy], [0, 0, 1]]} if i % 2 else {"fl_y": fx})
+
+    edit(capture, change)
+    after = load(capture).train_dataset.cameras
+    for name in ("fx", "fy", "cx", "cy", "width", "height"):
+        assert torch.equal(getattr(before, name), getattr(after, name))
 
 
 def test_numbers_in_quotes(capture: Path) -> None:

@@ -13,6 +13,7 @@ from nerfstudio.cameras.camera_utils import fisheye624_project
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.export.trained import world_of
@@ -254,8 +255,12 @@ def test_photographs_outside_of_the_capture_are_named(
 # files of a model, and sizes
 
 
-def test_points_of_a_model_in_a_ply_file_alone(project: Path) -> None:
+@pytest.mark.parametrize("empty", [None, "", "# 3D point list\n\n"])
+def test_points_of_a_model_in_a_ply_file_alone(project: Path, empty: str | None) -> None:
     (project / "sparse/0/points3D.txt").unlink()
+    if empty is not None:
+        (project / "sparse/0/points3D.txt").write_text(empty)
+    assert read_model(project / "sparse/0").xyz.shape == (0, 3)
     path = project / "sparse/0/points3D.ply"
     write_cloud(path, [[0, 0, 0.5], [0.1, 0, 0.5]])
     metadata = load_any(project).train_dataparser_outputs.metadata

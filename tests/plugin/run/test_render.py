@@ -177,7 +177,8 @@ def test_odd_sizes_and_single_frames(
     camera_path(path_of(1, render_width=33, render_height=25), output_path=tmp_path / "new" / "odd")
     _, frames = decoded(tmp_path / "new" / "odd.mp4")
     assert [frame.shape for frame in frames] == [(24, 32, 3)]
-    assert "of 33 x 25 pixels the last row or column is left out" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "of 33 x 25 pixels the last row or column is left out" in told and "1 frames of 32 x 24, " in told
 
 
 def test_an_interrupted_film_leaves_the_earlier_one(wall: Wall, camera_path: Any, tmp_path: Path) -> None:

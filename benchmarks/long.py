@@ -36,7 +36,7 @@ from torch import Tensor
 
 from bitymi_ns import bake_scene
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.files import Busy, Lock
+from bitymi_ns.locks import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
 from bitymi_ns.measure.machine import commit
 from bitymi_ns.plugin.run.metrics import LPIPS, lpips_metrics

@@ -20,7 +20,7 @@ from bitymi_ns.capture.readings import AUTO, WRITTEN, Reading, as_meant
 from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
 from bitymi_ns.capture.scanner_views import Y_UP, scanner_photographs
 from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
-from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, read_split_lists
+from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, lists_by_name, read_split_lists
 from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
 from bitymi_ns.capture.types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.trust import listed
@@ -135,7 +135,7 @@ class Capture:
     photographs: list[Photograph]  # in the order of their names, Blender's train, val and test after one another
     points: Points | None  # to start from; None = random ones
     frame: FrameOptions
-    lists: NameLists = field(default_factory=dict)  # its own lists for training and evaluation
+    lists: NameLists = field(default_factory=lambda: NameLists({}))  # its own lists for training and evaluation
     parts: dict[str, Sequence[int]] = field(default_factory=dict)  # photographs of "train", and held out "val", "test"
     downscale: int = 1  # factor by which photographs are reduced
     applied: Pose | None = None  # transform [4, 4] that its files state as applied, with a scale
@@ -254,7 +254,7 @@ class _Reader:
         own = model_points(model, TO_Z_UP)
         if need_photos and self.want_points and options.points == "auto":
             own = self._colored(own, model.without_colors, photographs, source.folder)
-        points, lists = self._points(own, photographs, where), read_split_lists(found.folder)
+        points, lists = self._points(own, photographs, where), read_split_lists(found.folder, source.folder)
         return Capture(
             found.format, where, photographs, points, options, lists, {}, source.downscale, TO_Z_UP,
             report=source.report, model=None if source.origin is None else source,
@@ -270,7 +270,8 @@ class _Reader:
         self._check(f"{source} ({found.format}, {len(photographs)} photographs with their poses)", photographs, named)
         photographs = self._as_meant(photographs, source)
         points = self._points(None, photographs, source)
-        return Capture(found.format, source, photographs, points, self.options, downscale=self.downscale)
+        lists = lists_by_name([each.file for each in photographs] if found.format == "pose-files" else [])
+        return Capture(found.format, source, photographs, points, self.options, lists, downscale=self.downscale)
 
     def _blender(self) -> Capture:
         """Read a Blender data set with its own split. If one of the val and test files is missing, or lacks all its

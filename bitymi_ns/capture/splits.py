@@ -16,7 +16,14 @@ from bitymi_ns.safe_reading import read_text
 from bitymi_ns.trust import listed
 
 Mode = Literal["fraction", "filename", "interval", "all"]
-NameLists = dict[str, list[str]]  # names of photographs by split: train, val, test
+NSVF = {"0": "train", "1": "val", "2": "test"}  # splits by the first number of NSVF's names
+
+
+class NameLists(NamedTuple):
+    """Names of photographs by split (train, val, test), and who states them."""
+
+    names: dict[str, list[str]]
+    source: str = "the capture's own lists"
 
 
 @dataclass
@@ -68,7 +75,7 @@ def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: S
         split = by_names(names, options.eval_names, "--eval-names")
         held = {frames[i] for i in split.held_out}
         return split_members(Split(sorted(set(frames) - held), sorted(held), split.rule), frames)
-    if lists:
+    if lists.names:
         return by_lists(names, lists)
     of_first = [names[i] for i in groups]
     split = by_mode(of_first, options.eval_mode, options.eval_interval, options.train_split_fraction)
@@ -106,15 +113,14 @@ def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split
 
 
 def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
-    """Split by the capture's own lists; "val" and "test" are held out."""
-    source = "the capture's own lists"
+    """Split by a capture's own lists; "val" and "test" are held out."""
 
     def indices(split: str) -> set[int]:  # downscaled photographs are in another folder than the lists state
-        return set(find_named(names, lists.get(split, []), source, any_folder=True))
+        return set(find_named(names, lists.names.get(split, []), lists.source, any_folder=True))
 
     held_out = indices("val") | indices("test")
-    train = indices("train") if "train" in lists else set(range(len(names))) - held_out
-    return Split(sorted(train), sorted(held_out), f"by {source}")
+    train = indices("train") if "train" in lists.names else set(range(len(names))) - held_out
+    return Split(sorted(train), sorted(held_out), f"by {lists.source}")
 
 
 def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
@@ -122,23 +128,33 @@ def read_names(names_or_file: Sequence[str]) -> tuple[str, ...]:
     if len(names_or_file) != 1 or not names_or_file[0].lower().endswith((".txt", ".lst", ".list")):
         return tuple(names_or_file)
     path = Path(os.path.expanduser(names_or_file[0]))
-    with parsing(f"--eval-names: {path}", "Give names, or a text file with one per line."):
-        lines = read_text(path).splitlines()
-    names = tuple(line.strip() for line in lines if line.strip() and not line.startswith("#"))
+    names = _names_in(path, f"--eval-names: {path}")
     if not names:
         fail(f"--eval-names: {path} lists no names. Write the name of one photograph per line.")
-    return names
+    return tuple(names)
 
 
-def read_split_lists(folder: Path) -> NameLists:
-    """Read the lists of names of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`."""
-    lists = {}
-    for split, name in (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test")):
-        path = folder / f"{name}_list.txt"
-        if path.is_file():
-            with parsing(path, "Write one name on each line, in UTF-8."):
-                lists[split] = [line.strip() for line in read_text(path).splitlines() if line.strip()]
-    return lists
+def _names_in(path: Path, what: object) -> list[str]:
+    with parsing(what, "Write one name on each line, in UTF-8."):
+        return [line.strip() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
+
+
+def read_split_lists(folder: Path, model: Path) -> NameLists:
+    """Read the lists of names of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`; else
+    3DGS's `test.txt` in the model's folder."""
+    of_split = (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test"))
+    files = [(split, folder / f"{name}_list.txt") for split, name in of_split]
+    found, test = {split: _names_in(path, path) for split, path in files if path.is_file()}, model / "test.txt"
+    return NameLists({"test": _names_in(test, test)}, str(test)) if not found and test.is_file() else NameLists(found)
+
+
+def lists_by_name(files: Sequence[Path]) -> NameLists:
+    """List photographs by NSVF's names, which begin with 0_, 1_ or 2_; no lists unless all do, and some with 0_ and
+    some with another."""
+    found: dict[str, list[str]] = {}
+    for file in files:
+        found.setdefault(NSVF.get(file.name.partition("_")[0], ""), []).append(str(file))
+    return NameLists({} if "" in found or "train" not in found or len(found) < 2 else found, "NSVF's names")
 
 
 Pair = tuple[int, int]  # index of a training photograph, and of a held-out one

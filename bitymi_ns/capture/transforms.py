@@ -120,7 +120,7 @@ def read_transforms(
         photographs = downscaled(photographs, path.parent, downscale)
     named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
     stated = {split: names for split, names in lists.items() if names is not None}
-    return Transforms(path, meta, photographs, stated, named)
+    return Transforms(path, meta, photographs, NameLists(stated), named)
 
 
 def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:

@@ -28,6 +28,15 @@ def test_byte_order_marks(project: Path, encoding: str) -> None:
     assert len(manager.train_dataset) == 10
 
 
+def test_3dgs_list_of_held_out_views(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = project / "sparse/0/test.txt"
+    path.write_text("frame_00004.png\nframe_00007\n")
+    assert held_out(load_any(project)) == ["frame_00004.png", "frame_00007.png"]
+    assert f"2 of 12 photographs, by {path} (frame_00004.png, frame_00007.png)" in printed(capsys)
+    (project / "test_list.txt").write_text("frame_00001.png\n")
+    assert held_out(load_any(project)) == ["frame_00001.png"]
+
+
 @pytest.mark.parametrize("name", ["{}", "my {}", "my photo {}"])
 def test_images_without_their_second_line(project: Path, name: str) -> None:
     path = project / "sparse/0/images.txt"

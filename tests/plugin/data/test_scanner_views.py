@@ -10,8 +10,8 @@ import pytest
 from bitymi_ns.capture.depth_normal_maps import read_depth
 from bitymi_ns.capture.scanner_views import _intrinsics
 from tests.capture.test_video import overwrite_packets
-from tests.captures import load_any, printed
-from tests.formats import SCANS, scanner_app, scannet, seven_scenes, stray_scanner
+from tests.captures import held_out, load_any, printed
+from tests.formats import SCANS, nsvf, scanner_app, scannet, seven_scenes, stray_scanner
 
 
 @pytest.mark.parametrize("layout", SCANS)
@@ -55,6 +55,15 @@ def test_cameras_of_folders_with_poses(tmp_path: Path) -> None:
     ):  # fmt: skip
         (tmp_path / "intrinsics.txt").write_text("\n".join(" ".join(map(str, row)) for row in numbers))
         assert _intrinsics(tmp_path) == (40, fy, 24, 18)
+
+
+def test_nsvfs_names_are_its_split(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    manager = load_any(folder := nsvf(capture))
+    assert held_out(manager) == ["1_0010.png", "2_0011.png"] and len(manager.train_dataset) == 10
+    assert "2 of 12 photographs, by NSVF's names (1_0010.png, 2_0011.png)" in printed(capsys)
+    for file in [*folder.glob("*/1_*"), *folder.glob("*/2_*")]:
+        file.rename(file.with_name(f"0{file.name[1:]}"))
+    assert held_out(load_any(folder)) == ["0_0000.png", "0_0008.png"]
 
 
 def test_a_pose_that_was_lost(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ SOURCE = re.compile(r"(?<![\w./-])[\w/]+\.(?:py|h|cpp|cu|cmake)\b")
 DOTTED = re.compile(r"`([a-zA-Z_]\w*(?:\.\w+)+)`")
 FOREIGN = {"activations.py"}
 """Files of other projects in the pages."""
-DATA = set("json jsonl ply glb usdc ktx2 webp png jpg yml yaml toml py h txt pth wgsl bin".split())
+DATA = set("json jsonl ply glb usdc ktx2 webp png jpg yml yaml toml py h txt pth wgsl bin npz npy sfm geojson".split())
 MENTION = re.compile(r"\b(?:docs|benchmarks)/[\w/]+\.md\b")
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.capture.find_files import FileFinder, renamed_message
-from bitymi_ns.capture.folder_contents import is_photograph, photographs_below, result_in
+from bitymi_ns.capture.folder_contents import photographs_below, photographs_in, result_in
 from bitymi_ns.capture.masks import LEAVE_OUT, USUAL_FOLDERS, downscaled_masks, mask_folder, masks_named
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.recognise import Found
@@ -175,7 +175,7 @@ def warn_left_out(source: Source) -> set[Path]:
         say(f"The COLMAP model {source.folder}: {other}")
     used = {_name_in(source.image_folder, path) for path in files}
     nested = any("/" in name for name in used)
-    there = photographs_below(source.photographs) if nested else filter(is_photograph, source.photographs.glob("*"))
+    there = (photographs_below if nested else photographs_in)(source.photographs)
     names = {path.relative_to(source.photographs).as_posix() for path in there}
     unused = sorted((names | source.left_out.keys()) - used)
     if unused:

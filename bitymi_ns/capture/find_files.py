@@ -11,7 +11,8 @@ from functools import cached_property
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from bitymi_ns.capture.folder_contents import PHOTOGRAPHS, passed_over, result_in
+from bitymi_ns.capture.folder_contents import passed_over, result_in
+from bitymi_ns.capture.kinds import PHOTOGRAPHS
 from bitymi_ns.capture.types import MAP_FILES, MapFiles, Photograph, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed
 

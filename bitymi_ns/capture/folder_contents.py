@@ -1,71 +1,46 @@
-"""Tell photographs from other pictures of a folder: results of this package and of nerfstudio, wherever they lie, maps,
-masks, and files of other programs that are not read."""
+"""Tell photographs from other pictures of a folder by the table of `kinds.py`, and name what is not read."""
 
+import fnmatch
 import os
 import re
+import shlex
 from collections import defaultdict
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
+from functools import cache
 from pathlib import Path
 
 import pillow_heif
 from PIL import Image
 
+from bitymi_ns.capture.kinds import (
+    BUNDLE,
+    FILM,
+    FOLDERS,
+    PHOTOGRAPHS,
+    PICTURES,
+    POSES,
+    RENDERED,
+    RENDERS,
+    RESULTS,
+    RUN,
+    SPLITS,
+    UNREAD,
+    VIDEOS,
+    Kind,
+)  # fmt: skip
 from bitymi_ns.safe_reading import MOST_TEXT, open_regular
 from bitymi_ns.trust import listed
 
 pillow_heif.register_heif_opener()  # for all users of Pillow
 
-PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
 FORMATS_OF_PICTURES = (
     "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "JPEG2000", "GIF", "PPM", "TGA"
 )  # fmt: skip
 """Formats of photographs and masks by Pillow's names, whatever the file name; not EPS, a program that Ghostscript
 runs."""
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
-DYNAMIC_MASK = "dynamic_mask_"
-"""Prefix of instant-ngp's masks beside photographs; black counts in them."""
-RENDERED = b"rendered by bitymi-ns"
-"""Comment in pictures and films of ns-render: frames are named as photographs are."""
-BUNDLE, RUN = "pictures of a bundle", "pictures of a training run"
-RESULT_FILES = {
-    "bundle.json": (b'"bitymi-bundle"', BUNDLE),
-    "config.yml": (b"!!python/object", RUN),
-    "pictures.json": (b'"bitymi_pictures"', "pictures of `bitymi bench pictures`"),
-    "transforms_eval.json": (b'[\n    {\n        "file_path"', "pictures beside cameras of ns-export"),
-}
-"""Files that mark a folder as a result: their content, and what the folder's pictures are."""
 HEAD = 1 << 20  # bytes of a file that are searched for a mark
-_RENDERS = "renders of ns-render"
-_SPLIT_FOLDERS = {"train", "val", "test", "train+test"}
-_MAPS = {"accumulation", "beta", "overdraw", "expected_depth"}
-"""Folders that ns-render writes beside `rgb`, and captures lack; so are those that begin with raw- or gt-."""
-RAW = "raw data of a camera"
-UNREAD = {
-    **dict.fromkeys((".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw"), RAW),
-    ".jxl": "JPEG XL", ".exr": "OpenEXR", ".hdr": "Radiance HDR", ".psd": "Photoshop",
-}  # fmt: skip
-"""Formats of unread images by extension."""
-UNREAD_POSES = {
-    "poses_bounds.npy": "LLFF", "cameras_sphere.npz": "NeuS", "cameras.npz": "IDR", "cameras.sfm": "Meshroom",
-    "sfm_data.json": "OpenMVG", "reconstruction.json": "OpenSfM", "bundle.out": "Bundler", "bundle.rd.out": "Bundler",
-}  # fmt: skip
-"""Programs by their files of poses, in lower case."""
-METASHAPE = b"<camera "  # in the XML file of cameras that Metashape exports under any name
-OTHER_FOLDERS = {
-    "mask": "masks", "masks": "masks", "depth": "depth maps", "depths": "depth maps", "depth_maps": "depth maps",
-    "confidence": "confidence maps", "confidences": "confidence maps", "conf": "confidence maps",
-    "normal": "normal maps", "normals": "normal maps", "normal_maps": "normal maps", "thumbnail": "thumbnails",
-    "thumbnails": "thumbnails", "thumbs": "thumbnails", "sparse": "a model", "colmap": "a model", "dense": "a model",
-    "stereo": "a model", "outputs": "outputs of training", "renders": "renders", "@eadir": "thumbnails",
-    "segmentation": "segmentations", "segmentations": "segmentations", "semantic": "segmentations",
-    "exports": "exports", "wandb": "pictures of a log", "planar_projections": "pictures made of panoramas",
-}  # fmt: skip
-"""Content of a capture's folders without photographs, by name in lower case."""
-OTHER_FILES = {
-    r"thumb(nail)?(_\d+)?": "a thumbnail", r"material_0|textured_output": "a texture", r"dynamic_mask_.*":
-    "a mask of instant-ngp", r"depth_\d+|.*[._-]depth": "a depth map", r"conf_\d+": "a confidence map",
-}  # fmt: skip
-"""Pictures that are no photographs, by patterns of their names in lower case, without extension."""
+COMMENT = 1 << 10  # bytes at the start of a picture that are searched for its comment
+HIDDEN, OTHER, EVALUATED = map(Kind, ("", "", ""), ("hidden", "pictures of another capture", "renders of ns-eval"))
 
 
 def open_picture(file: Path) -> Image.Image:
@@ -75,9 +50,33 @@ def open_picture(file: Path) -> Image.Image:
     return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
 
-def is_photograph(path: Path) -> bool:
-    """Test for an image that is not a depth map, mask or thumbnail."""
-    return is_picture(path) and not _no_photograph(path)
+def holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
+    """Test if the first bytes of a file hold `mark`; False for unreadable files."""
+    try:
+        with open_regular(path) as file:
+            return mark in file.read(min(most, os.fstat(file.fileno()).st_size))
+    except OSError:
+        return False
+
+
+@cache
+def _pattern(names: str) -> re.Pattern[str]:
+    """Compile the patterns of a row; groups are what NAME stands for."""
+    return re.compile("|".join(fnmatch.translate(name).replace("NAME", "(.+)") for name in names.split()))
+
+
+def kind_of(path: Path, rows: Iterable[Kind], beside: Collection[str] = ()) -> Kind | None:
+    """Find the row of a file or folder, by its name with or without ending, the lower-case names `beside` it and its
+    content; None = the table does not know it."""
+    for row in rows:
+        for form in (path.name.lower(), path.stem.lower()):
+            if found := _pattern(row.names).match(form):
+                name = next(filter(None, found.groups()), "")
+                whose = [each.replace("NAME", name) for each in row.of.split()]
+                there = any(each in beside or ("*" in each and fnmatch.filter(beside, each)) for each in whose)
+                if (there or not whose) and (not row.mark or holds(path, row.mark, MOST_TEXT)):
+                    return row
+    return None
 
 
 def is_picture(path: Path) -> bool:
@@ -85,46 +84,73 @@ def is_picture(path: Path) -> bool:
     return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
 
-def _no_photograph(path: Path) -> str:
-    """Describe an image that is no photograph, by its name; empty for photographs."""
-    matching = (what for pattern, what in OTHER_FILES.items() if re.fullmatch(pattern, path.stem.lower()))
-    return next(matching, "")
+def look_in(folder: Path, among: Collection[Path] | None = None) -> Iterator[tuple[Path, Kind | None]]:
+    """Walk a folder: yield photographs with None, and other pictures, films and folders that are not searched with
+    their kinds. `among`: search below these folders only."""
+    for parent, below, names in os.walk(folder):
+        where, left = Path(parent), _left_out(Path(parent), below)
+        yield from ((where / name, kind) for name, kind in left.items() if kind is not HIDDEN)
+        below[:] = sorted(set(below) - left.keys()) if among is None or where in among else []
+        yield from _files(where, names)
 
 
-def no_photographs(folder: Path, beside: Collection[str] = ()) -> str:
-    """Describe the pictures of a folder without photographs, by its name, the names of folders `beside` it and the
-    results in it; empty = it may hold photographs."""
-    name = folder.name
-    if name.startswith("."):
-        return "hidden"
-    if known := OTHER_FOLDERS.get(name.lower()):
-        return known
-    if f"corrected_{name}" in beside:
-        return "raw copies of corrected pictures"
-    original, _, factor = name.rpartition("_")
-    if factor in ("2", "4", "8", "16") and original in beside:
-        return "reduced copies"
-    return result_in(folder)
+def _files(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, Kind | None]]:
+    """Yield the pictures, films and unread images of a folder with their kinds; raw data beside a photograph of the
+    same name, and films that can be read, are left out."""
+    paths = [folder / name for name in sorted(names) if not name.startswith(".")]
+    pictures = [path for path in paths if is_picture(path)]
+    stems = {path.stem.lower() for path in pictures}
+    beside = stems | {path.name.lower() for path in pictures}
+    for path in pictures:
+        yield path, kind_of(path, PICTURES, beside) or (RENDERS if holds(path, RENDERED, COMMENT) else None)
+    for path in paths:
+        if is_rendered_film(path):
+            yield path, FILM
+        elif path.stem.lower() not in stems and (unread := kind_of(path, UNREAD)):
+            yield path, unread
+
+
+def _left_out(parent: Path, below: Collection[str]) -> dict[str, Kind]:
+    """Map the names of subfolders that are not searched to what they hold. Captures in subfolders beside photographs
+    are left out, because they hold copies of these."""
+    names, found, captures = {name.lower() for name in below}, {}, []
+    for path in sorted(parent / name for name in below):
+        kind = HIDDEN if path.name.startswith(".") else kind_of(path, FOLDERS, names) or result_in(path)
+        if kind:
+            found[path.name] = kind
+        elif holds(path / "transforms.json", b'"transform_matrix"'):
+            captures.append(path.name)
+    if captures and (photographs_in(parent) or photographs_in(parent / "images")):
+        found |= dict.fromkeys(captures, OTHER)
+    return found
+
+
+def photographs_in(folder: Path) -> list[Path]:
+    """List the photographs of a folder by name; empty if it cannot be read."""
+    names = os.listdir(folder) if folder.is_dir() else ()
+    return [path for path, kind in _files(folder, names) if kind is None]
+
+
+def photo_folder(source: Path) -> Path:
+    """Return the folder of a capture's photographs: itself, or its `images`."""
+    images = source / "images"
+    return images if images.is_dir() and not photographs_in(source) else source
+
+
+def photographs_below(folder: Path) -> Iterator[Path]:
+    """Yield the photographs in and below a folder, without hidden folders and those of other content."""
+    return (path for path, kind in look_in(folder) if kind is None)
+
+
+def has_photographs(folder: Path) -> bool:
+    """Test for photographs in or below a folder."""
+    return any(True for _ in photographs_below(folder))
 
 
 def folders_in(folder: Path) -> list[Path]:
     """List the subfolders that may hold photographs."""
     names = [path.name for path in folder.iterdir() if path.is_dir()]
-    return sorted(folder / name for name in names if not no_photographs(folder / name, names))
-
-
-def has_photographs(folder: Path, below: bool = False) -> bool:
-    """Test for photographs in a folder, or in or `below` it."""
-    if not folder.is_dir():
-        return False
-    return any(True for _ in photographs_below(folder)) if below else any(map(is_photograph, folder.iterdir()))
-
-
-def photographs_below(folder: Path) -> Iterator[Path]:
-    """Yield the photographs in and below a folder, without hidden folders and those of other content."""
-    for parent, below, names in os.walk(folder):
-        below[:] = sorted(name for name, what in _skipped(Path(parent), below).items() if not what)
-        yield from filter(is_photograph, (Path(parent, name) for name in names))
+    return sorted(folder / name for name in {*names} - _left_out(folder, names).keys())
 
 
 def unreadable_in(folder: Path) -> str:
@@ -142,113 +168,79 @@ def videos_in(folder: Path, rendered: bool = False) -> list[Path]:
     return sorted(path for path in names if path.is_file() and is_rendered_film(path) is rendered)
 
 
-def _skipped(parent: Path, below: Collection[str]) -> dict[str, str]:
-    """Map the names of a folder's subfolders to what they hold if they are not searched; empty = search them. Captures
-    in subfolders beside photographs are skipped, because they hold copies of these."""
-    found = {name: no_photographs(parent / name, below) for name in sorted(below)}
-    marks = {name: parent / name / "transforms.json" for name, what in found.items() if not what}
-    captures = [name for name, file in marks.items() if holds(file, b'"transform_matrix"')]
-    if captures and (has_photographs(parent) or has_photographs(parent / "images")):
-        found |= dict.fromkeys(captures, "pictures of another capture")
-    return found
+def is_rendered_film(path: Path) -> bool:
+    """Test for a film that ns-render wrote."""
+    return path.suffix.lower() in VIDEOS and holds(path, RENDERED)
 
 
 def passed_over(folder: Path, used: Collection[Path] | None = None, copies: str | None = None) -> list[str]:
     """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out; given
     the `used` files, also other photographs in their folders and one level below. Folders whose names end in `copies`
     are left out: smaller copies, such as `images_2`."""
-    found, holding = [], {above for path in used or () for above in path.parents}
-    for parent, below, names in os.walk(folder):
-        skipped = _skipped(Path(parent), below)
-        for name, what in skipped.items():
-            if copies is not None and name.endswith(copies):
-                continue
-            if what not in ("", "hidden") and (count := _pictures(Path(parent, name), used or ())):
-                found.append(f"{Path(parent, name).relative_to(folder)} ({what}: {count})")
-        searched = used is None or Path(parent) in holding  # a folder of captures may hold a whole disk
-        below[:] = [name for name, what in skipped.items() if searched and not what]
-        read, unnamed = [name for name in names if is_picture(Path(parent, name))], []
-        alike: dict[str, list[Path]] = defaultdict(list)
-        for path in (Path(parent, name) for name in sorted(read)):
-            if used is not None and path in used:
-                continue
-            if what := _no_photograph(path):
-                alike[what].append(path.relative_to(folder))
-            elif used is not None:
-                unnamed.append(path.name)
-        for what, paths in alike.items():
-            found.append(f"{listed(paths, most=1)} ({what})")
-        if unnamed:
-            found.append(f"pictures of {parent} that nothing names ({listed(unnamed, most=2)})")
-        films = videos_in(Path(parent), rendered=True)
-        found += [f"{film.relative_to(folder)} (a film of ns-render)" for film in films]
-        for ending, count in pictures_among(names, read).items():
-            found.append(f"{count} {ending} of {parent} ({UNREAD[ending]}, which is not read)")
+    # a folder of captures may hold a whole disk
+    among = None if used is None else {above for path in used for above in path.parents}
+    groups: dict[tuple[Kind | None, Path, str], list[Path]] = defaultdict(list)
+    found = []
+    for path, kind in look_in(folder, among):
+        if kind is not None and path.is_dir():
+            count = sum(is_picture(each) and each not in (used or ()) for each in path.rglob("*"))
+            if count and not (copies and path.name.endswith(copies)):
+                found.append(f"{path.relative_to(folder)} ({kind.what}: {count}{_use(kind)})")
+        elif path not in (used or ()) and (used is not None or kind is not None):
+            groups[kind, path.parent, path.suffix.lower() if kind in UNREAD else ""].append(path)
+    for (kind, parent, ending), paths in groups.items():
+        if kind is None:
+            found.append(f"pictures of {parent} that nothing names ({listed([path.name for path in paths], most=2)})")
+        elif ending:
+            found.append(f"{len(paths)} {ending} of {parent} ({kind.what}, which is not read{_use(kind)})")
+        else:
+            found.append(f"{listed([path.relative_to(folder) for path in paths], most=1)} ({kind.what}{_use(kind)})")
     return found
 
 
-def _pictures(folder: Path, used: Collection[Path]) -> int:
-    """Count the unused pictures in and below a folder."""
-    walked = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
-    return sum(is_picture(path) and path not in used for path in walked)
+def _use(kind: Kind) -> str:
+    return f"; {kind.use}" if kind.use else ""
 
 
-def result_in(folder: Path) -> str:
-    """Describe the result that a folder's pictures are of, by its files; empty = none."""
+def result_in(folder: Path) -> Kind | None:
+    """Find the result that a folder's pictures are of, by what lies in it; None = none."""
     try:
         names = sorted(os.listdir(folder))
     except OSError:  # unreadable folders are allowed
-        return ""
-    for name, (mark, what) in RESULT_FILES.items():
-        if name in names and holds(folder / name, mark):
-            return what
-    if folder.name in _SPLIT_FOLDERS and any(name in _MAPS or name.startswith(("raw-", "gt-")) for name in names):
-        return _RENDERS
+        return None
+    rows = [row for row in RESULTS if row is not RENDERS or folder.name in SPLITS]
+    if found := next(filter(None, (kind_of(folder / name, rows) for name in names)), None):
+        return found
     pictures = [name for name in names if name.endswith((".jpg", ".png"))]
-    if not pictures:
-        return ""
-    if re.fullmatch(r"eval_img_\d{4,}\.png", pictures[-1]) and all(name.startswith("eval_") for name in pictures):
-        return "renders of ns-eval"
-    return _RENDERS if holds(folder / pictures[0], RENDERED, 1 << 10) else ""
+    if pictures and re.fullmatch(r"eval_img_\d{4,}\.png", pictures[-1]) and pictures[0].startswith("eval_"):
+        return EVALUATED
+    rendered = pictures and all(holds(folder / pictures[i], RENDERED, COMMENT) for i in (0, -1))
+    return RENDERS if rendered else None
 
 
 def refusal(folder: Path) -> str:
     """Say why a folder cannot be trained on, and what to do, if it is a bundle or a run; empty = it can."""
-    what = result_in(folder) if folder.is_dir() else ""
-    if what == BUNDLE:
+    what = result_in(folder) if folder.is_dir() else None
+    if what is BUNDLE:
         bundle = f"{folder} is a bundle, not a capture: give the folder of its photographs."
         return f"{bundle} `bitymi view {folder}` shows the bundle."
-    if what == RUN:
+    if what is RUN:
         advice = f"give the folder of its photographs, and --load-dir {folder}/nerfstudio_models to go on with the run."
         return f"{folder} is a training run, not a capture: {advice}"
     return ""
 
 
-def is_rendered_film(path: Path) -> bool:
-    """Test for a film that ns-render wrote."""
-    return holds(path, RENDERED)
-
-
-def holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
-    """Test if the first bytes of a file hold `mark`; False for unreadable files."""
-    try:
-        with open_regular(path) as file:
-            return mark in file.read(min(most, os.fstat(file.fileno()).st_size))
-    except OSError:
-        return False
-
-
-def poses_in(folder: Path) -> Iterator[tuple[Path, str]]:
-    """Yield a folder's files of poses, each with its program."""
-    for path in sorted(path for path in folder.iterdir() if path.is_file()):
-        if path.name.lower() in UNREAD_POSES:
-            yield path, UNREAD_POSES[path.name.lower()]
-        elif path.suffix.lower() == ".xml" and holds(path, METASHAPE, MOST_TEXT):
-            yield path, "Metashape"
-
-
-def pictures_among(names: Sequence[str], read: Sequence[str]) -> dict[str, int]:
-    """Count a folder's unread images by extension, without raw data beside a photograph of the same name in `read`."""
-    stems = {Path(name).stem.lower() for name in read}
-    endings = [path.suffix.lower() for path in map(Path, names) if path.stem.lower() not in stems]
-    return {ending: endings.count(ending) for ending in UNREAD if ending in endings}
+def poses_in(folder: Path) -> tuple[str, ...]:
+    """Describe the files of poses in a folder and its subfolders, with what converts them."""
+    found: dict[Kind, list[Path]] = defaultdict(list)
+    for where in (folder, *sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")):
+        for path in sorted(where.iterdir()) if os.access(where, os.R_OK) and not result_in(where) else ():
+            if path.is_file() and (kind := kind_of(path, POSES)):
+                found[kind].append(path)
+    described = []
+    for kind, paths in found.items():
+        names, use = listed([path.relative_to(folder) for path in paths], most=1), _use(kind)
+        for word, path in (("FILE", paths[0]), ("IMAGES", photo_folder(folder)), ("FOLDER", folder)):
+            use = use.replace(word, shlex.quote(str(path)))
+        described.append(f"{names} ({kind.what}{use})")
+    return tuple(described)

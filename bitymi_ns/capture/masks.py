@@ -9,8 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.folder_contents import DYNAMIC_MASK, PHOTOGRAPHS, open_picture
+from bitymi_ns.capture.folder_contents import open_picture
 from bitymi_ns.capture.image_files import has_transparency, image_size, in_proportion, in_threads, wrong_size
+from bitymi_ns.capture.kinds import PHOTOGRAPHS
 from bitymi_ns.capture.sfm_photos import COPY
 from bitymi_ns.capture.types import Photograph, fail, parsing, say
 from bitymi_ns.trust import listed
@@ -21,6 +22,8 @@ USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "co
 """Usual folders of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
 """Lossy formats by Pillow's names: black may come back as almost black."""
+DYNAMIC_MASK = "dynamic_mask_"
+"""Prefix of instant-ngp's masks beside photographs; black counts in them."""
 MIDDLE = 127  # threshold of lossy masks, of 255
 
 

@@ -15,15 +15,16 @@ from pydantic import TypeAdapter
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.folder_contents import VIDEOS, refusal, unreadable_in, videos_in
+from bitymi_ns.capture.folder_contents import photo_folder, refusal, unreadable_in, videos_in
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
+from bitymi_ns.capture.kinds import VIDEOS
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.prepare import IMAGES, colmap_masks, emptied, upright_photos
 from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.sfm_photos import Photo, blurred, check_names, duplicates, find_photos, photo_folder, read_photos
+from bitymi_ns.capture.sfm_photos import Photo, blurred, check_names, duplicates, find_photos, read_photos
 from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, FoundPoses, SfmOptions, is_full_sphere
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file

@@ -170,11 +170,8 @@ class _Reader:
     def read(self) -> Capture:
         found = self.found
         if found.unread:
-            named = listed([f"{path.name} ({program})" for path, program in found.unread])
-            warn(
-                f"{found.folder} holds poses that cannot be read: {named}. Poses are computed from the photographs. "
-                "To have those used, export a COLMAP model, or convert them with `ns-process-data`."
-            )
+            named = listed(found.unread, most=12)
+            warn(f"{found.folder} holds poses that are not read: {named}. Poses are computed from the photographs.")
         readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
         capture = {**readers, "blender": self._blender}.get(found.format, self._transforms)()
         capture.poses_as = self.poses_as

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bitymi_ns.capture import folder_contents
+from bitymi_ns.capture.kinds import PHOTOGRAPHS, UNREAD, VIDEOS
 from bitymi_ns.capture.types import fail
 from bitymi_ns.safe_reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
@@ -37,7 +38,7 @@ class Found:
     file."""
     folder: Path  # of the capture, to which names in its files are relative
     others: tuple[tuple[Format, Path], ...] = ()  # captures beside it that are not read
-    unread: tuple[tuple[Path, str], ...] = ()  # files of poses that cannot be read, with their programs
+    unread: tuple[str, ...] = ()  # files of poses that are not read, with what converts them
 
     def how_to_choose(self) -> str:
         """Describe captures that are not read, and how to read them; empty if there are none."""
@@ -90,20 +91,20 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     others = [each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video")]
     if chosen == "stray-scanner":
         others = [each for each in others if each[1].name != STRAY[2]]
-    poses = tuple(folder_contents.poses_in(folder)) if chosen in ("photographs", "video") else ()
+    poses = folder_contents.poses_in(folder) if chosen in ("photographs", "video") else ()
     return Found(chosen, path, path if chosen == "blender" else folder, tuple(others), poses)
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
     """Find the only subfolder that is a capture with poses, as unpacked archives have; None = none, several, or
     photographs beside it."""
-    if folder_contents.has_photographs(folder):
+    if folder_contents.photographs_in(folder):
         return None
-    found = []
-    for path in sorted(path for path in folder.iterdir() if path.is_dir() and not folder_contents.no_photographs(path)):
-        candidates = [*_transforms_in(path), *_scanned(path)]
-        if any(format in ("auto", each) for each, _ in candidates):
-            found.append(path)
+    found = [
+        path
+        for path in folder_contents.folders_in(folder)
+        if any(format in ("auto", each) for each, _ in (*_transforms_in(path), *_scanned(path)))
+    ]
     return found[0] if len(found) == 1 else None
 
 
@@ -113,7 +114,7 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
         yield "blender", file.parent
     elif suffix == ".json":
         yield _kind_of(file), file
-    elif suffix in folder_contents.VIDEOS:
+    elif suffix in VIDEOS:
         yield "video", file
     elif file.stem in ("cameras", "images", "points3D") and is_model(file.parent):
         yield "colmap", file.parent
@@ -219,9 +220,9 @@ def image_count(model: Path) -> int:
 def _photographs_in(folder: Path) -> Path | None:
     """Choose the folder to search for photographs: this one if it or its `images` holds some, or several subfolders do;
     else the same within the only subfolder that does. None = no photographs, or subfolders that are captures."""
-    if folder_contents.has_photographs(folder) or folder_contents.has_photographs(folder / "images", below=True):
+    if folder_contents.photographs_in(folder) or folder_contents.has_photographs(folder / "images"):
         return folder
-    holding = [path for path in folder_contents.folders_in(folder) if folder_contents.has_photographs(path, below=True)]
+    holding = list(filter(folder_contents.has_photographs, folder_contents.folders_in(folder)))
     if not holding or captures_in(folder):
         return None
     return _photographs_in(holding[0]) if len(holding) == 1 else folder
@@ -229,11 +230,8 @@ def _photographs_in(folder: Path) -> Path | None:
 
 def captures_in(folder: Path) -> list[Path]:
     """List the subfolders whose `images` hold photographs, as captures of their own; empty if there is only one."""
-    found = [
-        path
-        for path in folder_contents.folders_in(folder)
-        if folder_contents.has_photographs(path / "images", below=True)
-    ]
+    folders = folder_contents.folders_in(folder)
+    found = [path for path in folders if folder_contents.has_photographs(path / "images")]
     return found if len(found) > 1 else []
 
 
@@ -260,11 +258,13 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
             return f"{data} is a bundle in one file, not a capture: give the folder of its photographs."
         if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
             return f"{data} is an archive. Unpack it, and give the folder."
-        if data.suffix.lower() in folder_contents.PHOTOGRAPHS:
+        if data.suffix.lower() in PHOTOGRAPHS:
             return f"{data} is one photograph. A scene needs many: give the folder that holds them."
+        if unread := folder_contents.kind_of(data, UNREAD):
+            return f"{data} cannot be read: it is {unread.what}. To have it used, {unread.use}."
         return (
             f"{data} is no file that can be trained on. Give a folder of photographs, a video "
-            f"({', '.join(folder_contents.VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
+            f"({', '.join(VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
         )
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
@@ -273,10 +273,6 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
     several = captures_in(data)
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
-    counts = folder_contents.pictures_among([path.name for path in data.rglob("*")], [])
-    if counts and not several:
-        most = max(counts, key=counts.__getitem__)
-        hint = f" It holds {counts[most]} files {most} ({folder_contents.UNREAD[most]}): save them as JPEG or TIFF."
     archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
     if archive is not None and not several:
         hint = f" Unpack {archive.name} first."

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.depth_normal_maps import MapFiles, maps_beside, maps_called
 from bitymi_ns.capture.find_files import check_photographs_exist
-from bitymi_ns.capture.folder_contents import is_photograph
+from bitymi_ns.capture.folder_contents import photographs_in
 from bitymi_ns.capture.image_files import image_size, in_proportion
 from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.pose_checks import rotations
@@ -76,7 +76,7 @@ def _polycam(folder: Path) -> list[ScannedPhotograph]:
     """Read Polycam's cameras and images, the corrected ones if there are any."""
     keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     images, cameras = next((keyframes / i, keyframes / c) for i, c in POLYCAM if (keyframes / c).is_dir())
-    rows = []
+    rows, pictures = [], _images(images)
     for path in sorted(cameras.glob("*.json"), key=lambda path: natural(path.name)):
         with parsing(path, AGAIN):
             values = read_json(path)
@@ -84,8 +84,8 @@ def _polycam(folder: Path) -> list[ScannedPhotograph]:
             pose[:3] = [[float(values[f"t_{i}{j}"]) for j in range(4)] for i in range(3)]
             size = (int(values["width"]), int(values["height"])) if "width" in values else None  # since late in 2025
             pinhole = tuple(float(values[name]) for name in ("fx", "fy", "cx", "cy"))
-        pictures = [*filter(is_photograph, images.glob(f"{path.stem}.*")), images / f"{path.stem}.jpg"]
-        rows.append(ScannedPhotograph(pictures[0], Y_UP @ pose, pinhole, size))
+        picture = pictures.get(path.stem, images / f"{path.stem}.jpg")
+        rows.append(ScannedPhotograph(picture, Y_UP @ pose, pinhole, size))
     return rows
 
 
@@ -112,10 +112,9 @@ def _record3d(folder: Path) -> list[ScannedPhotograph]:
 def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
     """Read 3D Scanner App's frames: frame_00012.json with camera to world and camera matrix, both row-major; beside it
     depth, confidence and, for some frames, a picture."""
-    rows = []
+    rows, pictures = [], _images(folder)
     for path in sorted(folder.glob("frame_*.json"), key=lambda path: natural(path.name)):
-        picture = next(filter(is_photograph, folder.glob(f"{path.stem}.*")), None)
-        if picture is None:
+        if path.stem not in pictures:
             continue
         with parsing(path, AGAIN):
             values = read_json(path)
@@ -123,7 +122,7 @@ def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
             fx, _, cx, _, fy, cy, *_ = _numbers(values["intrinsics"], 9)
         number = path.stem.removeprefix("frame_")
         maps = maps_called(folder, f"depth_{number}", f"conf_{number}")
-        rows.append(ScannedPhotograph(picture, Y_UP @ pose, (fx, fy, cx, cy), maps=maps))
+        rows.append(ScannedPhotograph(pictures[path.stem], Y_UP @ pose, (fx, fy, cx, cy), maps=maps))
     return rows
 
 
@@ -199,7 +198,7 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
 def _images(folder: Path, *names: str) -> dict[str, Path]:
     """List photographs by stem in the first of these subfolders, or in the folder itself."""
     images = next((folder / name for name in names if (folder / name).is_dir()), folder)
-    return {file.stem: file for file in images.iterdir() if is_photograph(file)}
+    return {file.stem: file for file in photographs_in(images)}
 
 
 def _pose(values: Sequence[float]) -> Pose:

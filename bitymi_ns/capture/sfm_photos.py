@@ -16,7 +16,7 @@ import numpy.typing as npt
 from PIL import ExifTags, Image, ImageOps
 
 from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
-from bitymi_ns.capture.folder_contents import is_photograph, open_picture, photographs_below
+from bitymi_ns.capture.folder_contents import open_picture, photographs_below
 from bitymi_ns.capture.image_files import eight_bits, in_srgb
 from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.types import CaptureError, is_full_sphere
@@ -55,12 +55,6 @@ class Photo:
     thumb: np.ndarray  # [h,w] float32 grey levels, longer side THUMB
     sharpness: float  # see `sharpness`
     panorama: bool = False  # a 360-degree picture
-
-
-def photo_folder(source: Path) -> Path:
-    """Return the folder of a capture's photographs: itself, or its `images`."""
-    images = source / "images"
-    return images if images.is_dir() and not any(map(is_photograph, source.iterdir())) else source
 
 
 def find_photos(folder: Path) -> list[str]:

@@ -11,11 +11,11 @@ from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.colmap_views import Origin, Source, find_masks, make_source
-from bitymi_ns.capture.folder_contents import passed_over, videos_in
+from bitymi_ns.capture.folder_contents import passed_over, photo_folder, videos_in
 from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
+from bitymi_ns.capture.kinds import FILM
 from bitymi_ns.capture.recognise import Found
-from bitymi_ns.capture.sfm_photos import photo_folder
 from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
 from bitymi_ns.safe_reading import read_json
@@ -53,7 +53,7 @@ def find_sfm_source(
     if found.format == "photographs":
         others = passed_over(found.path)
     else:
-        others = [f"{film.name} (a film of ns-render)" for film in videos_in(found.path.parent, rendered=True)]
+        others = [f"{film.name} ({FILM.what})" for film in videos_in(found.path.parent, rendered=True)]
     if others:
         say(f"Not taken for photographs in {found.folder}: {listed(others, most=12)}.")
     with rich_progress() as progress:

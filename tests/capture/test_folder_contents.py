@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.bundle.manifest import FORMAT
-from bitymi_ns.capture.folder_contents import RENDERED, passed_over, pictures_among, poses_in, result_in
+from bitymi_ns.capture.folder_contents import passed_over, poses_in, result_in
+from bitymi_ns.capture.kinds import RENDERED
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.sfm_photos import find_photos
@@ -31,7 +32,7 @@ RESULTS = {
     "worst/view0003-photo.png": "pictures of `bitymi bench pictures`",
     "processed/images/a.jpg": "pictures of another capture",
     "processed/images_2/a.jpg": "pictures of another capture",
-    "exports/mesh/material_0.png": "exports",
+    "exports/mesh/material_0.png": "results of programs",
 }
 MARKS = {
     "scene/bundle.json": MANIFEST,
@@ -130,14 +131,17 @@ def test_poses_of_other_programs(tmp_path: Path) -> None:
     (tmp_path / "config.xml").write_text("<settings/>")
     (tmp_path / "poses_bounds.npy").touch()
     (tmp_path / "cameras.npz").mkdir()
-    found = {path.name: program for path, program in poses_in(tmp_path)}
-    assert found == {"Cameras.xml": "Metashape", "poses_bounds.npy": "LLFF"}
+    command = (
+        f"ns-process-data metashape --data {tmp_path} --xml {tmp_path}/Cameras.xml --num-downscales 0 --output-dir"
+    )
+    assert poses_in(tmp_path) == (f"Cameras.xml (Metashape; `{command} NEW` converts it)", "poses_bounds.npy (LLFF)")
 
 
-def test_raw_data_beside_photographs_do_not_count() -> None:
-    names = ["a.DNG", "b.dng", "c.nef", "d.jxl", "a.jpg", "notes.txt"]
-    assert pictures_among(names, ["a.jpg"]) == {".dng": 1, ".nef": 1, ".jxl": 1}
-    assert pictures_among(["a.jpg"], ["a.jpg"]) == {}
+def test_raw_data_beside_photographs_do_not_count(tmp_path: Path) -> None:
+    for name in ("a.DNG", "b.dng", "c.nef", "notes.txt"):
+        (tmp_path / name).touch()
+    save(tmp_path / "a.jpg")
+    assert [each.split(" of ")[0] for each in passed_over(tmp_path)] == ["1 .dng", "1 .nef"]
 
 
 @pytest.mark.parametrize("read", [recognise, find_poses])

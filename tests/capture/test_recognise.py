@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.folder_contents import passed_over
+from bitymi_ns.capture.folder_contents import passed_over, photo_folder
 from bitymi_ns.capture.recognise import image_count, models_in, recognise
-from bitymi_ns.capture.sfm_photos import find_photos, photo_folder
+from bitymi_ns.capture.sfm_photos import find_photos
 from bitymi_ns.capture.types import CaptureError
 
 POSE = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
@@ -212,7 +212,10 @@ def test_pictures_that_are_no_photographs_are_named(tmp_path: Path) -> None:
     for name in ("rgb/1.jpg", "depth/1.png", "depth/2.png", "sub/Masks/1.png", "thumbnail.jpg", ".hidden/masks/1.png"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         Image.new("RGB", (8, 8)).save(tmp_path / name)
-    assert passed_over(tmp_path) == ["depth (depth maps: 2)", "thumbnail.jpg (a thumbnail)", "sub/Masks (masks: 1)"]
+    assert passed_over(tmp_path) == [
+        "depth (depth maps: 2)", "sub/Masks (masks: 1; `bitymi-data --masks-path` uses them)",
+        "thumbnail.jpg (a thumbnail)",
+    ]  # fmt: skip
     for folder in ("outputs/room/bitymi", "renders", "@eaDir/a.jpg"):
         photograph(tmp_path / folder, "SYNOPHOTO_THUMB_XL.jpg")
     assert find_photos(tmp_path) == ["rgb/1.jpg"]
@@ -221,8 +224,9 @@ def test_pictures_that_are_no_photographs_are_named(tmp_path: Path) -> None:
 def test_pictures_among_photographs_that_are_none(tmp_path: Path) -> None:
     for name in ("IMG_1.jpg", "depth_00001.png", "depth_00002.png", "conf_00001.png", "dynamic_mask_IMG_1.png"):
         Image.new("L", (8, 8)).save(tmp_path / name)
-    Image.new("L", (8, 8)).save(tmp_path / "conf.png")
-    assert find_photos(tmp_path) == ["conf.png", "IMG_1.jpg"]
+    for name in ("conf.png", "dynamic_mask_b.png"):  # of no photograph
+        Image.new("L", (8, 8)).save(tmp_path / name)
+    assert find_photos(tmp_path) == ["conf.png", "dynamic_mask_b.png", "IMG_1.jpg"]
     assert passed_over(tmp_path) == [
         "conf_00001.png (a confidence map)",
         "depth_00001.png and 1 more (a depth map)",
@@ -258,7 +262,7 @@ def test_poses_in_a_file_of_another_name(tmp_path: Path) -> None:
     (tmp_path / "poses_bounds.npy").touch()
     other.unlink()
     path.unlink()
-    assert recognise(tmp_path).unread == ((tmp_path / "poses_bounds.npy", "LLFF"),)
+    assert recognise(tmp_path).unread == ("poses_bounds.npy (LLFF)",)
     usual = transforms(tmp_path, **PINHOLE)
     assert (recognise(tmp_path).path, recognise(tmp_path).others, recognise(tmp_path).unread) == (usual, (), ())
 
@@ -266,8 +270,13 @@ def test_poses_in_a_file_of_another_name(tmp_path: Path) -> None:
 def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     for name in ("a.CR2", "b.CR2", "c.jxl"):
         photograph(tmp_path / "photos", name)
-    with pytest.raises(CaptureError, match="holds 2 files .cr2 .raw data of a camera.: save them as JPEG or TIFF"):
+    with pytest.raises(
+        CaptureError,
+        match="taken for photographs: 2 .cr2 of .* .raw data of a camera, which is not read; save it as JPEG",
+    ):
         recognise(tmp_path)
     for name in ("a.JPG", "b.JPG"):
         photograph(tmp_path / "photos", name)
-    assert passed_over(tmp_path) == [f"1 .jxl of {tmp_path}/photos (JPEG XL, which is not read)"]
+    assert passed_over(tmp_path) == [
+        f"1 .jxl of {tmp_path}/photos (no format of photographs, which is not read; save it as JPEG or TIFF)"
+    ]

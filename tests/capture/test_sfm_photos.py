@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 
+from bitymi_ns.capture.folder_contents import photo_folder
 from bitymi_ns.capture.sfm_photos import (
     blurred,
     duplicates,
     find_photos,
     in_srgb,
     natural,
-    photo_folder,
     read_photo,
     read_photos,
     upright,

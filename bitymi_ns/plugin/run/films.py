@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from bitymi_ns.capture.folder_contents import RENDERED
+from bitymi_ns.capture.kinds import RENDERED
 from bitymi_ns.files import complete_file, complete_folder, write_file
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.scene.baked import as_bytes

@@ -59,7 +59,7 @@ def test_a_folder_of_masks_beside_the_photographs(
     assert "`bitymi-data --use-masks False` leaves masks out" in (text := printed(capsys)) and "masks" in text
     assert "Not taken for photographs" not in text or "masks (" not in text
     assert "mask" not in load_any(place, use_masks=False).cached_train[0]
-    assert "masks (masks: 12)" in printed(capsys)
+    assert "masks (masks: 12; `bitymi-data --masks-path` uses them)" in printed(capsys)
 
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp])
@@ -89,7 +89,7 @@ def test_a_folder_with_some_of_the_masks_or_of_something_else(
         path.unlink()
     next((capture / "masks").iterdir()).rename(capture / "masks/mask.png")  # ns-process-data's name for a common mask
     assert "mask" not in load_any(capture).cached_train[0]
-    assert "Not taken for photographs" in (text := printed(capsys)) and "masks (masks: 1)" in text
+    assert "Not taken for photographs" in (text := printed(capsys)) and "masks (masks: 1; " in text
 
 
 def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,4 +142,4 @@ def test_pictures_that_nothing_names_are_named(
         load_any(place, downscale_factor=2)
         assert "images_2" not in printed(capsys)
         load_any(place)
-        assert "images_2 (reduced copies: 13)" in printed(capsys)
+        assert "images_2 (reduced copies: 13; `bitymi-data --downscale-factor` uses them)" in printed(capsys)

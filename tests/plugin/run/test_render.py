@@ -22,6 +22,7 @@ from nerfstudio.scripts import render
 from PIL import Image
 
 from bitymi_ns.capture.folder_contents import is_rendered_film, result_in
+from bitymi_ns.capture.kinds import RENDERS
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.hooks import patch_render
@@ -203,10 +204,10 @@ def test_frames_replace_earlier_frames_and_nothing_else(wall: Wall, camera_path:
     assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["00000.png", "00001.png"]
     picture = np.array(Image.open(tmp_path / "frames" / "00000.png"))
     assert picture.shape == (24, 32, 4) and (picture[..., 3] == 255).all()
-    assert result_in(tmp_path / "frames") == "renders of ns-render"
+    assert result_in(tmp_path / "frames") is RENDERS
     (tmp_path / "maps").mkdir()
     write_image(tmp_path / "maps" / "a.jpg", picture[..., :3], fmt="jpeg")
-    assert result_in(tmp_path / "maps") == "renders of ns-render"
+    assert result_in(tmp_path / "maps") is RENDERS
     (tmp_path / "frames" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match="holds other files than frames and is not replaced"):
         camera_path(**frames)

@@ -1,0 +1,98 @@
+"""The table of what files are: every row takes effect in a capture, and docs/capture.md prints it."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from bitymi_ns.capture.folder_contents import passed_over, poses_in
+from bitymi_ns.capture.kinds import FOLDERS, PICTURES, POSES, RENDERS, RESULTS, UNREAD, Kind
+from bitymi_ns.capture.sfm_photos import find_photos
+
+PAGE = Path(__file__).resolve().parents[2] / "docs/capture.md"
+TABLES = {
+    "pictures": PICTURES,
+    "folders": FOLDERS,
+    "what is in a folder of results": RESULTS,
+    "formats that are not read": UNREAD,
+    "poses that are not read": POSES,
+}
+
+
+def of(table: tuple[Kind, ...]) -> Iterator[tuple[Kind, str, str]]:
+    """Yield each name of a row, and one that lies beside it, as they may be in a capture."""
+    for row in table:
+        for name in row.names.split():
+            for whose in row.of.split() or [""]:
+                yield row, *(each.replace("[0-9]*", "12").replace("[._-]", "_").replace("[1-5]", "3")
+                             .replace("NAME", "img").replace("*", "12") for each in (name, whose))  # fmt: skip
+
+
+def save(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", (8, 8)).save(path, {".tif": "TIFF"}.get(path.suffix, "PNG"))
+
+
+def test_the_page_prints_the_table() -> None:
+    lines = []
+    for title, table in TABLES.items():
+        lines += ["", f"| {title} | |", "|---|---|"]
+        for row in table:
+            beside = f" beside `{row.of}`" if row.of else ""
+            lines.append(f"| `{row.names}`{beside} | {row.what} |")
+    assert "\n".join(lines) in PAGE.read_text("utf8"), "\n".join(lines)
+
+
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(PICTURES)))
+def test_pictures_that_are_no_photographs(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
+    photograph, other = (each if "." in each[-4:] else f"{each}.png" for each in (whose or "photograph", name))
+    save(tmp_path / other.upper())
+    assert find_photos(tmp_path) == ([other.upper()] if row.of else [])  # the only picture of its photograph is one
+    save(tmp_path / photograph)
+    assert find_photos(tmp_path) == [photograph]
+    assert passed_over(tmp_path)[0].startswith(f"{other.upper()} ({row.what}")
+
+
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(FOLDERS)))
+def test_folders_without_photographs(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
+    save(tmp_path / name / "a.png")
+    assert bool(find_photos(tmp_path)) == bool(row.of)
+    save(tmp_path / (whose or "images") / "a.png")
+    assert find_photos(tmp_path) == [f"{whose or 'images'}/a.png"]
+    assert passed_over(tmp_path)[0].startswith(f"{name} ({row.what}: 1")
+
+
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(RESULTS)))
+def test_results(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
+    folder = tmp_path / "test"
+    save(folder / "rgb/a.png")
+    if row is RENDERS:
+        (folder / name).mkdir()
+    else:
+        assert find_photos(tmp_path)
+        (folder / name).write_bytes(row.mark)
+    assert not find_photos(tmp_path) and passed_over(tmp_path)[0].startswith(f"test ({row.what}: 1")
+
+
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(UNREAD)))
+def test_formats_that_are_not_read(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
+    (tmp_path / name.upper()).touch()
+    assert not find_photos(tmp_path)
+    assert passed_over(tmp_path) == [f"1 {Path(name).suffix} of {tmp_path} ({row.what}, which is not read; {row.use})"]
+
+
+@pytest.mark.parametrize("below", ["", "deeper/"])
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(POSES)))
+def test_poses_of_other_programs(tmp_path: Path, row: Kind, name: str, whose: str, below: str) -> None:
+    for each in ("a", "b"):
+        save(tmp_path / f"images/{each}.png")
+    place = tmp_path / below / name.upper()
+    place.parent.mkdir(exist_ok=True)
+    if row.mark:
+        place.touch()
+        assert not poses_in(tmp_path)
+    place.write_bytes(b"..." + row.mark)
+    (found,) = poses_in(tmp_path)
+    assert found.startswith(f"{below}{name.upper()} ({row.what}")
+    assert not {"FILE", "IMAGES", "FOLDER"} & {*found.replace("'", " ").split()}

@@ -263,6 +263,7 @@ class Extras:
         bundle = read_bundle(self.bundle, crop=self.crop)
         cameras = interchange.training_cameras(bundle)
         held_out = [] if self.crop else interchange.read_held_out(self.bundle, bundle)
+        removed = interchange.removal_line(self.kinds, output)
         with rich_progress() as progress:
             written = interchange.write_extras(
                 bundle,
@@ -275,6 +276,8 @@ class Extras:
                 progress=progress,
             )
         say(f"Wrote {output}" + (bundle.hidden and f"; {bundle.hidden}"))
+        if removed:
+            say(removed)
         for each in written.values():
             say(interchange.summary_line(each))
         if not cameras:

@@ -3,7 +3,9 @@
 import errno
 import os
 import re
+import signal
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -56,10 +58,20 @@ def line_of(error: BaseException) -> str | None:
     return f"{name} cannot be read or written: {cause}"
 
 
+def end_as_by_ctrl_c() -> None:
+    """Have the signals of batch systems and of terminals that are gone raise KeyboardInterrupt, so that what was begun
+    is removed; those that are handled or ignored stay as they are."""
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, signal.default_int_handler)
+
+
 def run(command: Callable[[], int]) -> int:
     """Run a command and return its exit status, also after exceptions that `line_of` describes.
 
     Ends silently if its output is a closed pipe, as with `| head`."""
+    end_as_by_ctrl_c()
     try:
         try:
             return command()
@@ -117,6 +129,7 @@ def install(then: Callable[[], str] = str) -> None:
     """
     global _then
     _then, before = then, sys.excepthook
+    end_as_by_ctrl_c()
 
     def handle(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         line = line_of(error)

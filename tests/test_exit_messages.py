@@ -74,6 +74,25 @@ def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
     assert done.returncode in (1, -signal.SIGINT)  # shells show 130
 
 
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("begun", ["exit_messages.install(); work()", "sys.exit(exit_messages.run(work))"])
+def test_signals_of_others_remove_what_was_begun(how: signal.Signals, begun: str, tmp_path: Path) -> None:
+    code = (
+        "import sys, time\n"
+        "from bitymi_ns import exit_messages, files\n"
+        "def work():\n"
+        f"    with files.complete_folder({str(tmp_path / 'a')!r}): print('begun', flush=True); time.sleep(60)\n"
+        f"{begun}"
+    )
+    heeds = partial(signal.signal, how, signal.SIG_DFL)  # nohup ignores one of them
+    command, pipe = [sys.executable, "-c", code], subprocess.PIPE
+    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, preexec_fn=heeds) as process:
+        assert process.stdout is not None and process.stdout.readline() == "begun\n"
+        os.kill(process.pid, how)
+        _, said = process.communicate()
+    assert said == "bitymi: interrupted\n" and list(tmp_path.iterdir()) == []
+
+
 def test_faults_of_the_program_keep_their_traceback() -> None:
     code = "from bitymi_ns import exit_messages; exit_messages.install(); raise ZeroDivisionError"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)

@@ -22,6 +22,7 @@ from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Pho
 from bitymi_ns.files import Tell
 from bitymi_ns.progress import Progress, no_progress, rich_progress
 
+FEW_POINTS = 10  # per photograph, below which little is known of the scene
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
@@ -73,7 +74,8 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
         pose = photograph.pose.copy()
         pose[:3] = mirror @ (pose[:3] - np.pad(middle[:, None], ((0, 0), (3, 0))))
         views.append(replace(photograph, camera=camera.rescaled(*stored), pose=pose))
-    say(f"{source} has no points: they are triangulated from the photographs, once. --points random does without.")
+    without = "`bitymi-data --points random`"
+    say(f"{source} has no points: they are triangulated from the photographs, once. {without} does without.")
     try:
         if any(mirrored) and not all(mirrored):
             raise CaptureError("some poses are mirrored against the others")
@@ -83,6 +85,8 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
         warn(f"No points can be triangulated: {error}. Training starts from random points.")
         return None
     say(f"{len(model.xyz):,} points have been triangulated; they are kept for later runs.")
+    if len(model.xyz) < FEW_POINTS * len(views):
+        warn(f"That is few for {len(views)} photographs, which share little detail: {without} may do better.")
     return Points(model.xyz @ mirror + middle, model.rgb)
 
 

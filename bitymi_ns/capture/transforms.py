@@ -31,7 +31,7 @@ from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, f
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import listed
 
-HOW_TO_GET_ONE = "Make one from photographs or a video: `bitymi sfm PHOTOGRAPHS --output CAPTURE`."
+HOW_TO_GET_ONE = "Give a folder of photographs or a video: their poses are found."
 HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write it again."
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")

@@ -82,10 +82,20 @@ def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
         raise BundleError(f"{what}: choose among {', '.join(FILES)}")
     if "usd" in kinds:
         check_usd()
-    lost = [file for kind, file in FILES.items() if kind not in kinds and (folder / file).exists()]
+    lost = _removed_by(kinds, folder)
     also = f", which also removes {', '.join(lost)} unless you ask for all kinds" if lost else ""
     made = [SUMMARY, *FILES.values()] if (folder / SUMMARY).is_file() else None
     check_replaceable(folder, "a folder of extras", made, overwrite, BundleError, f"--overwrite{also}")
+
+
+def _removed_by(kinds: Sequence[str], folder: Path) -> list[str]:
+    return [file for kind, file in FILES.items() if kind not in kinds and (folder / file).exists()]
+
+
+def removal_line(kinds: Sequence[str], folder: Path) -> str:
+    """Name the files of an earlier folder that extras of these kinds remove, as they may be of another bundle."""
+    lost = _removed_by(kinds, folder)
+    return f"Removed {', '.join(lost)} of the earlier {folder}: ask for all kinds that you want." if lost else ""
 
 
 def reserve_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:

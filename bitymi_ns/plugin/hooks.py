@@ -105,31 +105,34 @@ def _with_members(union: Any, more: Sequence[Any]) -> Any:
     return Union[(*members, *more)]  # noqa: UP007 - built at run time
 
 
-def refuse_without_config() -> None:
-    """Stop before nerfstudio loads a bundle without config.yml as YAML.
+def find_config() -> None:
+    """Take a folder's config.yml, and stop before nerfstudio loads what is none as YAML.
 
-    Changes: nothing; reads `sys.argv` when the plugin is loaded. For: commands with --load-config but MESH_COMMAND,
-    which reads such bundles. Without: yaml's traceback on binary data. Superfluous once nerfstudio reports an
-    unreadable config.yml.
+    Changes: --load-config in `sys.argv`, when the plugin is loaded. For: commands with that option but MESH_COMMAND,
+    which reads bundles without config.yml. Without: tracebacks of folders, missing files and binary data. Superfluous
+    once nerfstudio reports an unreadable config.yml.
     """
-    path = _given_config()
-    bundle = None if path is None else bundle_at(path)
-    if bundle is None or MESH_COMMAND in sys.argv[1:2]:
+    i, path = _given_config()
+    if path is None or MESH_COMMAND in sys.argv[1:2]:
         return
-    if bundle.is_file() or not (bundle / CONFIG).is_file():
-        fail(
-            f"{bundle} has no {CONFIG} for nerfstudio's commands: `bitymi unpack {bundle}` writes it as a folder with "
-            "one; give that."
-        )
+    bundle = bundle_at(path)
+    if bundle is not None and (bundle.is_file() or not (bundle / CONFIG).is_file()):
+        how = f"`bitymi unpack {bundle}` writes it as a folder with one; give that."
+        fail(f"{bundle} has no {CONFIG} for nerfstudio's commands: {how}")
+    config = path / CONFIG if path.is_dir() else path
+    if not config.is_file():
+        fail(f"there is no {config}: give the {CONFIG} of a run (ns-train says where it is) or of a bundle.")
+    if config != path:
+        sys.argv[i] = f"--load-config={config}" if "=" in sys.argv[i] else str(config)
 
 
-def _given_config() -> Path | None:
-    """Return --load-config of this process's command line; None without."""
+def _given_config() -> tuple[int, Path | None]:
+    """Return the index in `sys.argv` and the path of --load-config on this process's command line; None without."""
     for i, argument in enumerate(sys.argv):
-        name, _, value = argument.partition("=")
-        if name in ("--load-config", "--load_config") and (value or i + 1 < len(sys.argv)):
-            return Path(value or sys.argv[i + 1]).absolute()
-    return None
+        name, equals, value = argument.partition("=")
+        if name in ("--load-config", "--load_config") and (equals or i + 1 < len(sys.argv)):
+            return (i, Path(value).absolute()) if equals else (i + 1, Path(sys.argv[i + 1]).absolute())
+    return 0, None
 
 
 def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
@@ -140,7 +143,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     ns-viewer, ns-export. Without: no moved run or bundle opens, nor one used from another folder, and commands that
     cannot work end in tracebacks. Superfluous once eval_setup passes on the path that it loads.
     """
-    model, evaluated = config.pipeline.model, _folder_being_evaluated()
+    model, evaluated, found = config.pipeline.model, _folder_being_evaluated(), _running_command()
     if evaluated is not None:
         exit_messages.install()
         refuse_others()
@@ -153,10 +156,10 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
         datamanager = config.pipeline.datamanager
         data = datamanager.data or getattr(datamanager.dataparser, "data", None)
         if data is not None and not Path(data).exists() and has_cameras(model.bundle):  # its capture is gone
-            datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data))
+            gray = found is not None and render.needs_no_photographs(found[0])
+            datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data), gray=gray)
             datamanager.data = model.bundle
         if evaluated is not None:  # no pickled data may lie in a bundle
-            found = _running_command()
             measured = found is not None and type(found[0]).__name__ == "ComputePSNR"
             check = partial(check_same_capture, model.bundle) if measured else None
             hand_over(config, model.bundle / MANIFEST, {"step": 0, "pipeline": {}}, check)
@@ -227,7 +230,7 @@ def _running_command() -> tuple[Any, dict[str, Any]] | None:
 def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
     """Find the bundle whose config.yml is being loaded."""
     candidates = [] if evaluated is None else [evaluated]
-    given = _given_config()
+    _, given = _given_config()
     candidates += [recorded] if given is None else [given.parent, recorded]
     for folder in candidates:
         if (folder / MANIFEST).is_file() or folder.is_file():

@@ -1,6 +1,7 @@
 """Entry points of nerfstudio's method registry (pyproject.toml). Every ns-* command loads them and handles no errors,
 so nothing here raises: a method that fails to load reports why when it is used."""
 
+import functools
 import warnings
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -22,6 +23,7 @@ class UnavailableConfig(TrainerConfig):
         raise SystemExit(f"{self.method_name} is not available: {self.reason}")
 
 
+@functools.cache
 def _specification(name: str) -> MethodSpecification:
     try:
         from bitymi_ns.plugin.run.config import method_config
@@ -51,7 +53,7 @@ def _install() -> None:
             change()
         except Exception as error:  # noqa: BLE001 - see the module's docstring
             _warn(lost, error)
-    hooks.refuse_without_config()
+    hooks.find_config()
 
 
 def _warn(lost: str, error: Exception) -> None:
@@ -74,12 +76,11 @@ def _exports() -> list[Any]:
     ]
 
 
+def __getattr__(name: str) -> MethodSpecification:
+    """Make the registry entry of the preset `name`, with - for _: one of the entry points, or a user's own."""
+    if name.startswith("_"):
+        raise AttributeError(name)
+    return _specification(name.replace("_", "-"))
+
+
 _install()
-bitymi = _specification("bitymi")
-bitymi_quality = _specification("bitymi-quality")
-bitymi_fast = _specification("bitymi-fast")
-bitymi_sh = _specification("bitymi-sh")
-bitymi_sb = _specification("bitymi-sb")
-bitymi_sg = _specification("bitymi-sg")
-bitymi_field = _specification("bitymi-field")
-bitymi_notexture = _specification("bitymi-notexture")

@@ -78,7 +78,7 @@ class DensifyConfig:
     that cannot grow cannot add surfels where its errors are."""
     max_surfels: Annotated[Count, tyro.conf.arg(aliases=("--max-surfels",))] = 0
     """Number of surfels that densification grows to, and the maximum at any time; 0 = the thresholds decide. Replaces
-    `pixels_per_surfel`. Prunes may leave fewer."""
+    `pixels_per_surfel`. The prunes after the last densification leave fewer, by a quarter to two fifths."""
     min_surfels: Count = 100  # Minimum number of surfels that a prune leaves.
 
 
@@ -184,7 +184,8 @@ class TrainConfig:
     freeze_every: PositiveCount = 10
     """Interval of the steps that train the texture field after `freeze_after`; 1 = every step."""
     freeze_min_updates: Count = 300
-    """Short runs use a smaller interval, so that about this many steps after `freeze_after` still train the field."""
+    """Short runs use a smaller interval, so that about this many steps after `freeze_after` still train the
+    field; below 720 steps nothing is frozen."""
     field_warmup: Count = 500  # Steps over which the learning rate of the texture field rises to its full value.
     resolution_schedule: Count = 3000
     """Training starts at a lower image resolution and doubles it every this many steps; 0 = full size throughout. Runs

@@ -23,6 +23,7 @@ from bitymi_ns.bundle import strict_json
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.hooks import REFUSED
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.render import OUTPUTS
 from bitymi_ns.sample import generate
 from tests.e2e.exports import evaluate
 from tests.e2e.runs import a_run_of, rewrite
@@ -66,6 +67,18 @@ def test_films_and_cameras_need_a_bundle_alone(alone: Path, tmp_path: Path) -> N
     assert (tmp_path / "film.mp4").stat().st_size > 0
     exporter.ExportCameraPoses(load_config=alone / "config.yml", output_dir=tmp_path / "cameras").main()
     assert len(list((tmp_path / "cameras").iterdir())) == 2
+
+
+@pytest.mark.parametrize("names", [None, ["rgb", "raw-depth"]])
+def test_the_cameras_of_a_bundle_alone_are_drawn(alone: Path, tmp_path: Path, names: list[str] | None) -> None:
+    options: Any = {"load_config": alone / "config.yml", "output_path": tmp_path, "rendered_output_names": names}
+    render.DatasetRender(split="train", **options).main()
+    drawn = {path.name: len(list(path.iterdir())) for path in (tmp_path / "train").iterdir()}
+    every = set(OUTPUTS) - {"rgba"} if names is None else set(names)
+    assert drawn.keys() == every and len(set(drawn.values())) == 1 and drawn["rgb"] > 5
+    options["rendered_output_names"] = ["rgb", "gt-rgb"]
+    with pytest.raises(InputError, match="the capture is gone"):
+        render.DatasetRender(split="test", **options).main()
 
 
 def test_the_viewer_needs_a_bundle_alone(alone: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

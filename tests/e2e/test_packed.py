@@ -19,7 +19,7 @@ from bitymi_ns.bundle.manifest import dump
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.mesh import ExportMesh
 from bitymi_ns.plugin.export.trained import load_trained
-from bitymi_ns.plugin.hooks import refuse_without_config
+from bitymi_ns.plugin.hooks import find_config
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.trust import python_command
 
@@ -73,16 +73,33 @@ def test_nerfstudios_commands_name_the_command(
     packed: Path, copied: Path, command: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", [*command, "--load-config", str(copied / "config.yml")])
-    refuse_without_config()
+    find_config()
     (copied / "config.yml").unlink()
     for given in (packed, packed / "config.yml", copied / "config.yml"):
         monkeypatch.setattr(sys, "argv", [*command, f"--load-config={given}"])
         with pytest.raises(InputError, match="has no config.yml for nerfstudio's commands: `bitymi unpack "):
-            refuse_without_config()
+            find_config()
         monkeypatch.setattr(sys, "argv", ["ns-export", "bitymi-mesh", "--load-config", str(given)])
-        refuse_without_config()
+        find_config()
     with pytest.raises(InputError, match="that of a bundle, which is baked already"):
         load_trained(packed)
+
+
+def test_nerfstudios_commands_take_a_folder_and_name_what_is_missing(
+    bundle: Path, trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for folder in (bundle, trained.get_base_dir()):
+        for given, found in (
+            (["--load-config", str(folder)], str(folder / "config.yml")),
+            ([f"--load-config={folder}"], f"--load-config={folder / 'config.yml'}"),
+        ):
+            monkeypatch.setattr(sys, "argv", ["ns-eval", *given])
+            find_config()
+            assert sys.argv[-1] == found
+    for given in (tmp_path, tmp_path / "nowhere.yml"):
+        monkeypatch.setattr(sys, "argv", ["ns-eval", "--load-config", str(given)])
+        with pytest.raises(InputError, match="there is no .*yml: give the config.yml of a run"):
+            find_config()
 
 
 def test_the_command_ends_in_one_line(packed: Path) -> None:

@@ -114,6 +114,7 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
     args = ["extras", str(with_cameras), "--kinds", "gaussians", "--overwrite", "--frame", "capture"]
     assert cli.main(args) == 0
     assert {path.name for path in folder.iterdir()} == {"gaussians.ply", "extras.json"}
+    assert "Removed mesh.glb of the earlier " in " ".join(capsys.readouterr().out.split())
 
 
 def test_surfels_that_notes_hide_are_left_out_of_a_crop(

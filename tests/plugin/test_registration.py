@@ -2,8 +2,10 @@
 
 import importlib
 import re
+import shutil
 import sys
 import warnings
+from pathlib import Path
 
 import pytest
 
@@ -12,11 +14,14 @@ pytest.importorskip("nerfstudio")
 import torch
 import tyro
 import yaml
+from nerfstudio.plugins import registry
 from nerfstudio.plugins.types import MethodSpecification
 
 import bitymi_ns.plugin.run.config as config
 from bitymi_ns.plugin import hooks, methods
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
+from bitymi_ns.presets import preset_dir
+from bitymi_ns.train import preset
 
 NAMES = ["bitymi", *(f"bitymi-{name}" for name in ("quality", "fast", "sb", "sg", "sh", "field", "notexture"))]
 
@@ -27,6 +32,15 @@ def test_every_method_is_registered_under_its_name(name: str) -> None:
     assert isinstance(specification, MethodSpecification)
     assert specification.config.method_name == name
     assert not specification.description.startswith("not available")
+
+
+def test_a_preset_of_ones_own_is_a_method(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(preset_dir(), tmp_path / "method_configs")
+    (tmp_path / "method_configs/my-own.yaml").write_text("base: bitymi\nscene: {weight_bound: 0.03}\n")
+    monkeypatch.setattr(preset, "preset_dir", lambda: tmp_path / "method_configs")
+    monkeypatch.setenv("NERFSTUDIO_METHOD_CONFIGS", "my-own=bitymi_ns.plugin.methods:my_own")
+    found = registry.discover_methods()[0]["my-own"]
+    assert found.method_name == "my-own" and found.pipeline.model.scene.weight_bound == 0.03
 
 
 def test_a_method_parses_from_the_command_line() -> None:
@@ -97,8 +111,8 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("default")
             importlib.reload(methods)
+            specification = methods.bitymi_sh
         assert sum("not available" in str(w.message) for w in caught) == 1
-        specification = methods.bitymi_sh
         assert isinstance(specification, MethodSpecification)
         assert specification.config.method_name == "bitymi-sh"
         assert "not available" in specification.description
@@ -111,7 +125,7 @@ def test_a_failing_configuration_leaves_nerfstudio_alone(monkeypatch: pytest.Mon
         importlib.reload(methods)
 
 
-CHANGES = ("read_names_of_callers", "extend_exporter", "refuse_without_config")
+CHANGES = ("read_names_of_callers", "extend_exporter", "find_config")
 
 
 @pytest.mark.parametrize("failing", CHANGES[:2])

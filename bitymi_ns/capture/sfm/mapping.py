@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.sfm import features, pairs
+from bitymi_ns.capture.sfm import explain, features, pairs
 from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
 from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
 from bitymi_ns.capture.types import CONTRADICTED
@@ -23,6 +23,7 @@ MIN_ANGLE = 1.5  # least angle between rays of a point with depth, degrees; COLM
 GAIN = 0.03  # least relative drop of the reprojection error to choose OPENCV: few observations overfit its four terms
 OBSERVATIONS_PER_CAMERA = 2000  # least for OPENCV
 LEAST_POINTS = 10  # to start from
+TELLING = 100  # least matches of all pairs that blame poses which give no points from them
 
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
@@ -157,10 +158,11 @@ def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
         model = pycolmap.triangulate_points(model, database, job.images, scratch, options=options)
     tell("triangulating", 1, 1)
     if model.num_points3D() < LEAST_POINTS:
-        raise NoPoses(
-            f"only {model.num_points3D()} points can be triangulated from the given poses: the poses may belong to "
-            "other photographs, or be camera to world where world to camera is meant, or have other axes"
-        )
+        matches = sum(explain.view_graph(database).inliers.values())
+        why = "the poses may belong to other photographs, or have another convention"
+        if matches < TELLING:
+            why = f"the photographs share hardly any detail, {matches} matches in all"
+        raise NoPoses(f"only {model.num_points3D()} points can be triangulated from the given poses: {why}")
     # the triangulation changes poses by rounding
     for image in model.images.values():
         image.frame.rig_from_world = _pose(job.poses[image.name])

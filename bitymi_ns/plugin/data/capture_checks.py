@@ -79,7 +79,7 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
-        advice = f"Give its folder with --data. {HOW_TO_GET_ONE}" if trains else MOVED
+        advice = f"Correct --data. {HOW_TO_GET_ONE}" if trains else MOVED
         fail(f"the capture {data} does not exist. {advice}")
     check_options(dataparser, lambda name: f"--{name.replace('_', '-')}")
     if isinstance(dataparser, BitymiDataParserConfig):

@@ -107,6 +107,7 @@ class BundleCamerasConfig(DataParserConfig):
     _target: type = field(default_factory=lambda: BundleCameras)
     data: Path = Path()  # Folder of the bundle.
     capture: Path = Path()  # Folder of the lost capture.
+    gray: bool = False  # Photographs are grey; else they are refused.
 
 
 class BundleCameras(DataParser):
@@ -135,7 +136,7 @@ class BundleCameras(DataParser):
             cameras=pinhole_cameras(pinholes, torch.stack(poses)),
             dataparser_scale=float(info.world.scale),
             dataparser_transform=torch.tensor(np.asarray(info.world.transform, np.float64)[:3]),
-            metadata={NO_PHOTOS: True},
+            metadata={NO_PHOTOS: self.config.gray},
         )
 
 

@@ -43,7 +43,8 @@ class BitymiDataset(InputDataset):
         c2w[:, :3, :3] = torch.from_numpy(parts)
         super().__init__(dataparser_outputs, scale_factor)
         self._summaries: dict[int, ImageSummary] = {}
-        self.gray_images = False  # show missing photographs grey, for the viewer; else fail
+        # show missing photographs grey, where they are not asked for; else fail
+        self.gray_images = bool(dataparser_outputs.metadata.get(NO_PHOTOS))
         self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # views of one photograph follow each other
 
     @property

@@ -22,7 +22,7 @@ from bitymi_ns.plugin.console import fail, listed, say
 DATA = "BITYMI_DATA"
 """Environment variable with a capture's location, for which most of nerfstudio's commands have no option."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-NO_PHOTOS = "without photographs"  # metadata key of views of lost photographs
+NO_PHOTOS = "without photographs"  # metadata key of views of lost photographs; true: they are grey
 LONGEST_SIDE = 1600  # default longest side of training photographs, pixels; as in papers on such captures
 
 

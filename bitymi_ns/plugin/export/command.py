@@ -18,7 +18,15 @@ from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.files import reason, write_file
-from bitymi_ns.interchange import Frame, Kind, extras_folder, reserve_extras, summary_line, write_extras
+from bitymi_ns.interchange import (
+    Frame,
+    Kind,
+    extras_folder,
+    removal_line,
+    reserve_extras,
+    summary_line,
+    write_extras,
+)
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.summary import print_summary
@@ -203,10 +211,13 @@ class ExportAtlas(BakeOptions, CompactOptions):
             folder = extras_folder(self.output_dir)
             how = {"frame": self.extras_frame, "overwrite": self.overwrite}
             how |= {"cameras": [camera.to("cpu") for camera in views], "held_out": held_out}
+            removed = removal_line(self.extras, folder)
             with rich_progress() as progress:
                 written = write_extras(bundle, folder, self.extras, progress=progress, **how)
             for each in written.values():
                 say(f"In {folder}: {summary_line(each)}")
+            if removed:
+                say(removed)
 
 
 def main() -> None:

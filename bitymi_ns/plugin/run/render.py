@@ -38,6 +38,15 @@ FAINT = 1 / 255  # accumulation of a pixel that shows nothing
 OPTION = " (--output-path)."
 
 
+def needs_no_photographs(command: Any) -> bool:
+    """Return True for `ns-render dataset` of outputs alone; where it names none, it then draws all of them."""
+    if type(command).__name__ != "DatasetRender":
+        return False
+    if command.rendered_output_names is None:
+        command.rendered_output_names = [name for name in OUTPUTS if name != "rgba"]
+    return not any("gt-" in name for name in command.rendered_output_names)
+
+
 def _spiral_frames(command: Any) -> int:
     return int(command.frame_rate * command.seconds)
 

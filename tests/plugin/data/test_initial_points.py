@@ -85,6 +85,7 @@ def test_what_cannot_be_triangulated(
         Image.new("RGB", SIZE, (40 * i, 0, 0)).save(capture / f"images/{i}.png")
     assert "points3D_xyz" not in load_any(capture).train_dataparser_outputs.metadata
     assert "only 0 points can be triangulated from the given poses" in (text := printed(capsys))
+    assert "the photographs share hardly any detail, 0 matches in all" in text and "belong" not in text
     assert "Training starts from random points." in text
 
 
@@ -107,7 +108,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[Photograph]]:
 
 
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
-def test_every_format_without_points(capture: Path, form: Any, asked: list[Any]) -> None:
+def test_every_format_without_points(
+    capture: Path, form: Any, asked: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
     place = form(capture)
     if form is colmap:
         (place / "points3D.txt").unlink()
@@ -115,6 +118,8 @@ def test_every_format_without_points(capture: Path, form: Any, asked: list[Any])
         edit(place, lambda meta: meta.pop("ply_file_path", None))
     assert len(load_any(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
     (views,) = asked
+    assert "2 points have been triangulated" in (text := printed(capsys))
+    assert "few for 12 photographs, which share little detail: `bitymi-data --points random`" in text
     assert len(views) == 12 and views[3].camera.model == "PINHOLE" and views[3].camera.size == (48, 36)
     assert "points3D_xyz" not in load_any(capture, points="random").train_dataparser_outputs.metadata
     config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig())

@@ -8,7 +8,7 @@ from typing import NoReturn
 
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.exit_messages import INTERRUPTED as INTERRUPTED
@@ -17,13 +17,25 @@ from bitymi_ns.trust import printable
 
 
 @contextmanager
-def step_bar(done: int, total: int) -> Iterator[Callable[[int], None]]:
-    """Show a progress bar below other output in a terminal; yield the function to call with a finished step's index."""
-    columns = (TextColumn("step"), MofNCompleteColumn(), BarColumn(), TimeRemainingColumn())
+def step_bar(done: int, total: int) -> Iterator[Callable[[int, float | None], None]]:
+    """Show a progress bar below other output in a terminal; yield the function to call with a finished step's index,
+    and the seconds to the end if they are known."""
+    columns = (TextColumn("step"), MofNCompleteColumn(), BarColumn(), TextColumn("{task.fields[left]}"))
     hidden = not CONSOLE.is_terminal
     with Progress(*columns, console=CONSOLE, refresh_per_second=2, transient=True, disable=hidden) as bar:
-        task = bar.add_task("", completed=done, total=total)
-        yield lambda step: bar.update(task, completed=step + 1)
+        task = bar.add_task("", completed=done, total=total, left="")
+
+        def show(step: int, left: float | None) -> None:
+            bar.update(task, completed=step + 1, left="" if left is None else f"{duration(left)} left")
+
+        yield show
+
+
+def duration(seconds: float) -> str:
+    """Describe a length of time."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
 
 
 class InputError(SystemExit):

@@ -8,6 +8,10 @@ from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
+ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
+"""Number of views on which the error prune measures removals, as a share of the run's steps, and its minimum."""
+FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # likewise, for each of the four final prunes
+FEWEST_SURVEYED = 32  # minimum number of views to measure tiles on, in runs of any length
 PATIENT_STEPS = 3000  # runs of at least this many steps reach full size as early as the options say
 
 
@@ -83,6 +87,21 @@ class Schedule:
     def texel_steps(self) -> int:
         """Number of steps of the texel stage."""
         return self.max_steps - self.texels_start
+
+    @property
+    def error_views(self) -> int:
+        """Number of views on which the error prune measures removals, or all if there are fewer."""
+        return max(FEWEST_ERROR_VIEWS, round(ERROR_VIEWS * self.max_steps))
+
+    @property
+    def final_views(self) -> int:
+        """Number of views on which each final prune measures them, likewise."""
+        return max(FEWEST_FINAL_VIEWS, round(FINAL_VIEWS * self.max_steps))
+
+    @property
+    def survey_views(self) -> int:
+        """Number of views on which tiles of texels are measured, likewise."""
+        return max(FEWEST_SURVEYED, round(self.config.texels.views * self.texel_steps))
 
     @cached_property
     def short_run_gain(self) -> float:

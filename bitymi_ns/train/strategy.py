@@ -46,10 +46,7 @@ SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
 """Scales of the halves of a split surfel, along its long axis and across it, relative to the surfel's."""
 SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scales of its long axis
 SPLIT_OPACITY = 0.9  # opacity of the halves relative to the surfel's: they overlap where it is most opaque
-ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
-"""Number of views on which the error prune measures removals, as a share of the run's steps, and its minimum."""
 NO_BAD_PIXEL = 0.1  # added to counts of bad pixels when parents are sampled, so that surfels without any have a chance
-FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # as `ERROR_VIEWS`, for each of the four final prunes
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 
@@ -251,7 +248,7 @@ class Strategy:
     def _error_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
         report = self._drop_dead(scene, optimizers)
         every = torch.ones(len(scene), dtype=torch.bool, device=scene.surfels["means"].device)
-        drawn = self._error_views(views, ERROR_VIEWS, FEWEST_ERROR_VIEWS)
+        drawn = views(self.schedule.error_views, self.generator)
         pruned = self._expendable(every, self.config.densify.prune_error, scene, drawn)
         return report | self._prune(pruned, scene, optimizers)
 
@@ -260,12 +257,9 @@ class Strategy:
         """Remove the faint surfels that matter little; after an opacity reset many faint ones do matter."""
         report, config = self._drop_dead(scene, optimizers), self.config.densify
         faint = scene.surfels["opacity_logits"].sigmoid() < config.final_prune_opacity
-        drawn = self._error_views(views, FINAL_VIEWS, FEWEST_FINAL_VIEWS)
+        drawn = views(self.schedule.final_views, self.generator)
         pruned = self._expendable(faint, config.final_prune_error, scene, drawn)
         return report | self._prune(pruned, scene, optimizers)
-
-    def _error_views(self, views: DrawViews, share: float, fewest: int) -> Sequence[View]:
-        return views(max(fewest, round(share * self.schedule.max_steps)), self.generator)
 
     def _expendable(self, among: Tensor, share: float, scene: Scene, views: Sequence[View]) -> Tensor:
         """Select, [N] bool, the surfels `among` [N] bool that change the views least, together by at most a share of

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from bitymi_ns.train.schedules import Schedule
     from bitymi_ns.train.views import DownscaledViews, View
 
-FEWEST_VIEWS = 32  # minimum number of views to measure tiles on, in runs of any length
 SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
 FEW = 1 << 23  # total number of texels that runs of any length may have: 235 MB
 FEWER = 0.8  # factor on the texels per tile, repeated until the total is below the limit
@@ -56,7 +55,7 @@ class LearningTexels:
         self._views = len(views)
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
-        sample = spread(len(views), max(FEWEST_VIEWS, round(self.options.views * self.schedule.texel_steps)))
+        sample = spread(len(views), self.schedule.survey_views)
         sampled = OnDemand(len(sample), lambda i: views.at(sample[i], 1.0))
         field = None
         if self.processes.first:

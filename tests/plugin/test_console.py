@@ -1,6 +1,7 @@
 """Console output of a run: a few lines of its own, none of nerfstudio's about itself, nothing before the checks."""
 
 import io
+import re
 import warnings
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from rich.console import Console
 
 from bitymi_ns.plugin import console
 from bitymi_ns.plugin.console import InputError
+from bitymi_ns.plugin.run import callbacks
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig, method_config
+from bitymi_ns.train import forecast
 
 
 def run_on(capture: Path, output: Path) -> BitymiTrainerConfig:
@@ -58,6 +61,26 @@ def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatc
     screen = io.StringIO()
     monkeypatch.setattr(console, "CONSOLE", Console(file=screen, force_terminal=True, width=80))
     with console.step_bar(10, 40) as show_step:
-        show_step(19)
+        show_step(15, None)
+        show_step(19, 754.0)
         console.CONSOLE.print("a report")
-    assert "20/40" in screen.getvalue() and "a report\n" in screen.getvalue()
+    assert "20/40" in screen.getvalue() and "13 min left" in screen.getvalue() and "a report\n" in screen.getvalue()
+
+
+@pytest.mark.parametrize(("seconds", "text"), [(99, "99 s"), (3000, "50 min"), (11_000, "3.1 h")])
+def test_lengths_of_time(seconds: float, text: str) -> None:
+    assert console.duration(seconds) == text
+
+
+def test_a_long_run_says_at_the_start_when_it_will_end(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(forecast, "WARM", 0)
+    monkeypatch.setattr(forecast, "ENOUGH", 1)
+    monkeypatch.setattr(callbacks, "SOON", 0)
+    monkeypatch.setattr(forecast, "SURFEL", 0.001)
+    ns_train.main(run_on(capture, tmp_path / "outputs"))
+    printed = capsys.readouterr().out
+    assert printed.count("The run will end in about ") == 1 and printed.index("will end") < printed.index("step ")
+    assert re.search(r"at \d\d:\d\d; --pipeline.datamanager.longest-side 30 takes half as long\.", printed)
+    assert re.search(r"step +2 of 4: .* left\n", printed) and not re.search(r"step +4 of 4: .* left\n", printed)

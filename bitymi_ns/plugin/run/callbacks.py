@@ -4,6 +4,8 @@ import errno
 import json
 import math
 import os
+import time
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -17,7 +19,7 @@ from torch.nn import Parameter
 
 from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.files import reason, write_errors_as, write_file
-from bitymi_ns.plugin.console import InputError, fail, listed, say, warn
+from bitymi_ns.plugin.console import InputError, duration, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.run.memory import state_training
@@ -27,10 +29,13 @@ from bitymi_ns.scene.visibility import views_without_surfels
 from bitymi_ns.train import messages
 from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.forecast import Forecast, expected_surfels
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
 from bitymi_ns.trust import json_of, no_links
+
+SOON = 60  # seconds: when a run that takes less will end is not said
 
 
 class TrainingRun:
@@ -70,6 +75,7 @@ class TrainingRun:
             trainer.base_dir / FILE, None if resumed_from is None else resumed_from.parent / FILE, self.first_step
         )
         self.names = {"experiment_name": trainer.config.experiment_name, "method_name": trainer.config.method_name}
+        self._end_said = False
         self._held_back = False  # densification has met its bound, and a warning said so
         for sentence in (
             *messages.other_options(model.recorded_options, config),
@@ -88,7 +94,32 @@ class TrainingRun:
         most = self.training.strategy.most
         lists = self.training.schedule.lists_fragments(self.datamanager.train_dataset.has_maps)
         state_training(scene, cameras, most, texels, to_come, trainer.world_size, lists)
+        self.forecast = self._forecast([camera.width * camera.height for camera in cameras])
+        self._longest_side = max(max(camera.width, camera.height) for camera in cameras)
         self.datamanager.step_view = self.training.view
+
+    def _forecast(self, pixels: Sequence[int]) -> Forecast:
+        """Prepare the estimate of the run's end, from the pixels of its training views."""
+        mean, schedule, held_out = sum(pixels) / len(pixels), self.training.schedule, len(self.datamanager.eval_dataset)
+        first, most = self.datamanager.train_dataset.metadata["first_surfels"], self.training.strategy.most
+        surfels = expected_surfels(schedule, first, mean, most)
+        at_once = min(held_out, self._curve_views or held_out)
+        evaluated = {step: held_out if step + 1 >= self.total else at_once for step in self.curve_steps}
+        card = self.scene.surfels["means"].device.type == "cuda"
+        return Forecast(schedule, len(pixels), mean, surfels, evaluated, self.first_step, card)
+
+    def _say_end(self) -> None:
+        """Say once, after the first steps, when the run will end, and what would halve its time."""
+        left = self.forecast.left
+        if left is None or self._end_said or not self.forecast.settled:
+            return
+        self._end_said = True
+        if left < SOON:
+            return
+        when = time.strftime("%H:%M" if left < 20 * 3600 else "%Y-%m-%d %H:%M", time.localtime(time.time() + left))
+        side = 0 if self.scene.surfels["means"].is_cuda else 10 * int(self.forecast.half() * self._longest_side / 10)
+        half = f"; --pipeline.datamanager.longest-side {side} takes half as long" if side else ""
+        say(f"The run will end in about {duration(left)}, at {when}{half}.")
 
     def _check_start(self) -> None:
         """Stop, or warn, if views see nothing of what training starts from: they would give no gradient."""
@@ -120,6 +151,7 @@ class TrainingRun:
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None
+        self.forecast.begin()
         undecided, field = not self.training.exposure.decided, self.scene.field
         self.training.begin(step)
         if self.scene.field is not field:
@@ -151,6 +183,8 @@ class TrainingRun:
             writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
         if step in self.curve_steps:
             self._add_point(step)
+        self.forecast.end(step)
+        self._say_end()
 
     def _diverged(self, error: TrainingDiverged) -> NoReturn:
         fail(
@@ -184,6 +218,8 @@ class TrainingRun:
             writer.put_scalar("Held-out PSNR", torch.tensor(quality.psnr), step)
         self.curve.add({**point, **self.names})
         more = f"{shown}{point['surfels']:,} surfels, {self.training.clock.seconds:.0f} s of training"
+        if self.forecast.left and step + 1 < self.total:
+            more += f", {duration(self.forecast.left)} left"
         CONSOLE.print(f"step {step + 1:6,d} of {self.total:,}: {more}")
 
 

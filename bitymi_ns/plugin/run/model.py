@@ -112,6 +112,11 @@ class BitymiModel(SurfelModel):
         finally:
             logits.data = opacities
 
+    @property
+    def seconds_left(self) -> float | None:
+        """Seconds to the end of a run; None if they are not known."""
+        return None if self._run is None else self._run.forecast.left
+
     def sizes(self) -> dict[str, float]:
         return {"surfels": float(len(self.scene))}
 

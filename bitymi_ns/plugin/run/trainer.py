@@ -91,7 +91,7 @@ class BitymiTrainer(Trainer):
         return TogetherOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
 
     def _end_of_step(self, step: int) -> None:
-        self._show_step(step)
+        self._show_step(step, self.pipeline.model.seconds_left)
         if self.processes.any(self._stop_requested > 0):
             raise _StopAfterStep
 

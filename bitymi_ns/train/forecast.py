@@ -1,0 +1,112 @@
+"""Estimate what a run will cost: its surfels, and when it will end by the time of its steps so far."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+if TYPE_CHECKING:
+    from bitymi_ns.train.schedules import Schedule
+
+Steps = npt.NDArray[np.float64]
+"""A number for each step of a run."""
+
+GROWTH = 1.19  # factor of the number of surfels per densification, as measured on the captures of docs/training.md
+SURFELS_PER_PIXEL = 0.4  # surfels per pixel of a view at which they hardly grow any more
+KEPT = 0.7  # share of the surfels that the error prune leaves
+SURFEL = 1.5  # cost of a surfel in a step, relative to that of a pixel
+TEXELS = 1.3  # cost of a step with texels, relative to one without
+DRAWN = 0.5  # cost of a view that is drawn only, relative to a step
+WARM = 2  # first steps of a run, which are slower
+ENOUGH, PATIENCE = 20, 10.0  # steps, or seconds, after which the estimate is stated
+RECENT = 100  # steps over which times are averaged, the last one counting most
+
+
+def expected_surfels(schedule: Schedule, first: int, pixels: float, most: int = 0) -> Steps:
+    """Estimate the number of surfels in each step of a run.
+
+    Args:
+        first: number of surfels at the start.
+        pixels: of a view at full size.
+        most: number at which densification stops; 0: no limit.
+    """
+    given = schedule.config.densify.max_surfels
+    limit = given or max(first, min(most or np.inf, SURFELS_PER_PIXEL * pixels))
+    factors = np.ones(schedule.max_steps)
+    growth = (limit / max(1, first)) ** (1 / max(1, len(schedule.densify_steps))) if given else GROWTH
+    factors[list(schedule.densify_steps)] = growth
+    found = np.minimum(first * factors.cumprod(), limit)
+    for step in schedule.error_prune_steps:
+        found[step:] *= KEPT
+    return found
+
+
+class Forecast:
+    """Time that a run will still take. A step costs in proportion to its pixels and surfels, and what it draws beside
+    its view adds to it; a unit of this cost takes as long as it took in the last steps.
+
+    Attributes:
+        left: seconds to the end of the run; None before the first steps.
+        settled: `left` is of enough steps to be stated.
+    """
+
+    def __init__(
+        self,
+        schedule: Schedule,
+        views: int,
+        pixels: float,
+        surfels: Steps,
+        evaluated: Mapping[int, int],
+        first: int = 0,
+        card: bool = False,
+    ) -> None:
+        """
+        Args:
+            views: number of training views.
+            pixels: mean of a view at full size.
+            surfels: in each step (`expected_surfels`).
+            evaluated: number of views evaluated after a step, by step.
+            first: step with which the run begins, or goes on.
+            card: the run is on a card, where small pictures take as long as large ones.
+        """
+        steps = schedule.max_steps
+        size = np.array([1.0 if card else schedule.resolution_factor(step) ** 2 for step in range(steps)])
+        of_step = np.where(np.arange(steps) >= schedule.texels_start, TEXELS, 1.0)
+        at_full_size = np.zeros(steps)
+        of_step[list(schedule.densify_steps)] += DRAWN * min(views, schedule.config.densify.views)
+        of_step[list(schedule.error_prune_steps)] += min(views, schedule.error_views)
+        of_step[list(schedule.final_prune_steps)] += min(views, schedule.final_views)
+        if schedule.texels_start < steps:
+            at_full_size[schedule.texels_start] += DRAWN * min(views, schedule.survey_views)
+        for step, count in evaluated.items():
+            at_full_size[step] += DRAWN * count
+        self._by_pixels = (of_step * size + at_full_size) * pixels
+        self._by_surfels = (of_step + at_full_size) * surfels * SURFEL
+        units = self._by_pixels + self._by_surfels
+        self._units, self._after = units, units[::-1].cumsum()[::-1] - units
+        self._begin, self._warm, self._seconds, self._done = 0.0, first + WARM, 0.0, 0.0
+        self.left: float | None = None
+        self.settled = False
+
+    def begin(self) -> None:
+        """Note that a step begins."""
+        self._begin = time.perf_counter()
+
+    def end(self, step: int) -> None:
+        """Note that a step has ended, with what belongs to it."""
+        if step >= self._warm:
+            fade = 1.0 - 1.0 / RECENT
+            self._seconds = fade * self._seconds + time.perf_counter() - self._begin
+            self._done = fade * self._done + self._units[step]
+            self.left = float(self._seconds / self._done * self._after[step])
+            steps = step + 1 - self._warm
+            self.settled = steps >= ENOUGH or (steps > 1 and self._seconds > PATIENCE)
+
+    def half(self) -> float:
+        """Compute the factor of the pictures' sides by which the whole run takes half as long; 0 if none does."""
+        pixels, surfels = self._by_pixels.sum(), self._by_surfels.sum()
+        return float(max(0.0, 0.5 - 0.5 * surfels / pixels) ** 0.5)

@@ -57,10 +57,14 @@ class Environment:
 
 
 def interpreter_of(version: str) -> str:
-    """Find a Python on PATH; exit with its name if there is none."""
-    return shutil.which(f"python{version}") or sys.exit(
-        f"No 'python{version}' found on PATH: install Python {version} with venv, or name the other end alone "
-        "(make test-environment ENDS=...)"
+    """Find a Python on PATH that runs and has venv; exit with its name if there is none."""
+    found = shutil.which(f"python{version}")
+    tried = found and subprocess.run([found, "-c", "import ensurepip, venv"], capture_output=True, check=False)
+    if found and tried and tried.returncode == 0:
+        return found
+    sys.exit(
+        f"No 'python{version}' {f'that runs and has venv ({found} does not)' if found else 'found'} on PATH: install "
+        f"Python {version} with venv, or name the other end alone (make test-environment ENDS=...)"
     )
 
 

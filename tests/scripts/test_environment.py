@@ -28,7 +28,7 @@ def test_requirements_admit_the_versions_found(load: Callable[[str], ModuleType]
             assert found[canonicalize_name(requirement.name)] in requirement.specifier, str(requirement)
 
 
-def test_a_python_that_is_not_there_is_named(
+def test_a_python_that_is_not_there_or_does_not_run_is_named(
     script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
@@ -36,3 +36,9 @@ def test_a_python_that_is_not_there_is_named(
     with pytest.raises(SystemExit, match=r"No 'python3\.10' found on PATH"):
         script.main()
     assert not list(tmp_path.iterdir())
+    shim = tmp_path / "python3.10"  # as version managers leave, for versions that are not chosen
+    shim.write_text("#!/bin/sh\nexit 127\n")
+    shim.chmod(0o755)
+    with pytest.raises(SystemExit, match=r"No 'python3\.10' that runs and has venv .*/python3\.10 does not\)"):
+        script.main()
+    assert list(tmp_path.iterdir()) == [shim]

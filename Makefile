@@ -86,7 +86,7 @@ $(VENV)/.stamp-deps: $(VENV)/.stamp-torch constraints.txt pyproject.toml scripts
 	$(BIN)/python scripts/torchvision_remedy.py
 	@$(BIN)/python -c 'import open3d' || { \
 	  echo "open3d, which nerfstudio reads point clouds with, lacks a library of the system (last line above)." >&2; \
-	  echo "On Debian and Ubuntu: apt install libgl1 libx11-6 libudev1 libgomp1" >&2; exit 1; }
+	  echo "On Debian and Ubuntu: apt install libgl1 libegl1 libx11-6 libudev1 libusb-1.0-0 libidn2-0 libgomp1" >&2; exit 1; }
 	@touch $@
 
 # Editable: changes to Python are live, changes to C++ need another make (seconds: build/ is kept).

@@ -162,7 +162,7 @@ class Verify:
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file (bitymi pack).
     run_config: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """config.yml, folder or checkpoint of the run: also compare residuals and renders of the bundle with the run's."""
-    views: int = 4  # Held-out views to render.
+    views: int | None = None  # Held-out views of the run to render; not given: 4.
 
     def run(self) -> int:
         from rich.console import Console
@@ -172,11 +172,13 @@ class Verify:
         from bitymi_ns.bundle import REMEDY, check_files
         from bitymi_ns.bundle.parts import NOTES
 
+        if self.views is not None and self.run_config is None:
+            raise ValueError("--views is for the comparison with a run: name that, too (--run)")
         bundle, checks = check_files(self.bundle)
         if bundle is not None and self.run_config is not None:
             from bitymi_ns.plugin.export.trained import check_run
 
-            checks += check_run(bundle, self.run_config, self.views)
+            checks += check_run(bundle, self.run_config, 4 if self.views is None else self.views)
         table = Table("", "check", "result", title=escape(printable(f"Bundle {self.bundle}")))
         for check in checks:
             outcome = "[green]ok[/]" if check.ok else "[bold red]FAILED[/]"

@@ -24,7 +24,7 @@ from bitymi_ns.trust import UNFINISHED, Refused, is_left
 _REASONS = {
     errno.EROFS: "the file system is read-only: write to another one",
     errno.EACCES: "you have no permission to write there: choose another folder, or change its permissions",
-    errno.EPERM: "the system does not permit writing there: choose another folder",
+    errno.EPERM: "the system does not permit it, as after `chattr +i` (see `lsattr`): choose another name or folder",
     errno.ENOSPC: "the disk is full: free some space, or write to another disk",
     errno.EDQUOT: "your quota of disk space is used up: free some space, or write to another disk",
     errno.EFBIG: "the file would be larger than this system allows (see `ulimit -f`)",
@@ -137,10 +137,36 @@ def reserved(target: str | Path, check: Callable[[], None] | None = None, tell: 
             _recover(place)
             if check is not None:
                 check()
+            if outermost and os.path.lexists(place):
+                _check_movable(place)
             yield place
         finally:
             if outermost:
                 release(lock)
+
+
+def _check_movable(place: Path) -> None:
+    """Check that what is there can be replaced, which its attributes, or an overlay of which a lower layer has it, can
+    prevent. A folder is not moved: no file system renames it onto one that holds something."""
+    if not place.is_dir():
+        try:
+            os.close(os.open(place, os.O_WRONLY | os.O_NONBLOCK))
+        except OSError as error:
+            if error.errno == errno.EPERM:  # other errors do not prevent that it is replaced
+                raise
+        return
+    new, _ = _temporary_paths(place)
+    new.mkdir()
+    try:
+        (new / "something").mkdir()
+        place.rename(new)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+    finally:
+        for path in (new / "something", new):
+            with suppress(FileNotFoundError):
+                path.rmdir()
 
 
 def check_writable(target: Path) -> None:
@@ -148,6 +174,11 @@ def check_writable(target: Path) -> None:
     if not _is_device(target):
         with reserved(target):
             pass
+
+
+def check_folder(folder: Path) -> None:
+    """Check in advance that files can be written into a folder, which need not exist; raises what `reserved` raises."""
+    check_writable(folder / UNFINISHED)
 
 
 def _is_device(path: Path) -> bool:

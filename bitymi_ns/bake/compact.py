@@ -36,9 +36,10 @@ ENOUGH = 0.002
 """Added error, as a share of the bake's (0.009 dB), below which precision is not worth bytes that a size allows."""
 LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
-COARSER, FINER = 12.0, 1.0 / 32
-"""Factors of lambda that give about half and twice the bytes (bonsai, 45,000 surfels: 0.52 and 1.98)."""
-_SEARCH = 7
+ALTERNATIVES = {0.5: 12.0, 2.0: 1.0 / 32}
+"""Bytes, relative to the chosen ones, of the precisions that are stated beside, and first factors of lambda to try."""
+_SEARCH, _TRIES = 7, 4
+_CLOSE = 1.1  # largest ratio of the bytes of an alternative to those wanted, either way
 _CPU = torch.device("cpu")
 
 
@@ -117,15 +118,18 @@ class Coder:
         options: Compact,
         progress: Progress = no_progress,
         device: torch.device = _CPU,
+        held_out: Sequence[View] = (),
     ) -> None:
         """
         Args:
             baked: with lean view colours, on the CPU.
             views: training views; without any the reference steps are taken.
             background: [3] colour behind the scene.
+            held_out: views on which alternatives are stated; without any the training views.
         """
         options.check()
         self._baked, self._pictures = baked, Pictures(views, background, options.views, device)
+        self._held_out = Pictures(held_out, background, options.views, device)
         scene = baked.unquantised()
         self._sizes = baked.sizes.long()
         drawn = self._pictures.of(scene)
@@ -154,10 +158,10 @@ class Coder:
         return self._baked.colors.at(lmbda) if self._baked.colors is not None and self.measured else {}
 
     @torch.no_grad()
-    def at(self, lmbda: float) -> RatePoint:
+    def at(self, lmbda: float, held_out: bool = False) -> RatePoint:
         """Round and code everything at a lambda: squared error per bit, colours from 0 to 1, summed over the pixels
-        and channels of all views."""
-        baked = self._baked
+        and channels of all views. `held_out`: state error and PSNR of held-out views, if there are any."""
+        baked, pictures = self._baked, self._held_out if held_out and self._held_out.views else self._pictures
         surfels = {**baked.scene.surfels, **self._view_colors(lmbda)}
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
         codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)
@@ -186,8 +190,8 @@ class Coder:
         if coded is not None:
             decoded = rounded.with_alpha(coded.texels_of(coder.blocks))
             shown = replace(rounded, texels=decoded).with_constants(coded.constants)
-        drawn = self._pictures.of(shown.unquantised())
-        return RatePoint(lmbda, rounded, coding, coded, self._pictures.square(drawn), self._pictures.psnr(drawn))
+        drawn = pictures.of(shown.unquantised())
+        return RatePoint(lmbda, rounded, coding, coded, pictures.square(drawn), pictures.psnr(drawn))
 
 
 def compacted(
@@ -197,20 +201,19 @@ def compacted(
     options: Compact | None = None,
     progress: Progress = no_progress,
     device: torch.device = _CPU,
+    held_out: Sequence[View] = (),
 ) -> tuple[BakeState, TexelCodeOptions]:
     """Round the surfels of a bake to the values of a compact bundle, in Morton order, and choose the coding of the
     texels, for `tune.tune_atlas` or `with_coded_texels`.
 
     Args:
-        baked: with lean view colours, on the CPU.
-        views: training views; without any the reference steps are taken.
-        background: [3] colour behind the scene.
+        baked, views, background, held_out: as in `Coder`.
 
     Raises:
         ValueError: an option is out of range, or the target cannot be reached.
     """
     options = options or Compact()
-    return choose(Coder(baked, views, background, options, progress, device), options, progress)
+    return choose(Coder(baked, views, background, options, progress, device, held_out), options, progress)
 
 
 def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> tuple[BakeState, TexelCodeOptions]:
@@ -253,11 +256,24 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
 
 
 def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float]] | None:
-    """Measure bytes and PSNR of a coarser and a finer precision, relative to the chosen; None without views."""
+    """Measure bytes and PSNR at about half and twice the bytes, relative to the chosen; None without views."""
     if not coder.measured:
         return None
-    others = (coder.at(factor * chosen.lmbda) for factor in (COARSER, FINER))
-    return [(other.bytes / chosen.bytes, other.psnr - chosen.psnr) for other in others]
+    found, base = [], coder.at(chosen.lmbda, held_out=True).psnr
+    for wanted, factor in ALTERNATIVES.items():
+        tried = [(0.0, 0.0)]  # logarithms of lambda and bytes over the chosen ones
+        step = math.log(factor)
+        for _ in range(_TRIES):
+            other = coder.at(math.exp(step) * chosen.lmbda, held_out=True)
+            tried.append((step, math.log(other.bytes / chosen.bytes)))
+            if abs(tried[-1][1] - math.log(wanted)) < math.log(_CLOSE):
+                break
+            (a, low), (b, high) = sorted(tried, key=lambda each: abs(each[1] - math.log(wanted)))[:2]
+            if low == high:
+                break
+            step = max(-12.0, min(12.0, a + (math.log(wanted) - low) * (b - a) / (high - low)))
+        found.append((other.bytes / chosen.bytes, other.psnr - base))
+    return found
 
 
 def _search(

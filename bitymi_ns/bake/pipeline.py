@@ -152,7 +152,7 @@ def bake(
         baked = polish_scene(baked, photographs, background, polish, refine.train, progress, held_out, device)
     baked = prune_and_resample(baked, cameras, progress)
     if refine.compact is not None:
-        baked, coding = compacted(baked, photographs, background, refine.compact, progress, device)
+        baked, coding = compacted(baked, photographs, background, refine.compact, progress, device, held_out)
     if tune is not None and baked.textured:
         baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding, device)
     if baked.codes is not None and baked.codes.texels is None:

@@ -158,8 +158,8 @@ class Rounding(Part):
     """Mean squared error in the training views before texels were tuned, colours in [0, 1]."""
     steps: dict[str, NotNegative] = {}  # by column, as in `surfel_codes.REFERENCE`
     alternatives: Annotated[list[tuple[NotNegative, Decibels]], Field(max_length=16)] | None = None
-    """Other precisions: bytes relative to the chosen one, and PSNR difference over the training views, dB, before
-    texels were tuned."""
+    """Other precisions: bytes of surfels and texels relative to the chosen one, and PSNR difference over held-out
+    views, else the training views, dB, before texels were tuned."""
 
 
 class FineTuning(Part):

@@ -152,8 +152,8 @@ class SfmOptions(SfmSettings):
         least = {"max_image_size": 200, "max_features": 100, "frames": 3, "focal_length": 1}
         for name, limit in least.items():
             value = getattr(self, name)
-            if value is not None and not limit <= value < 1e6:
-                raise CaptureError(f"{name} is {value}: give a number of at least {limit}")
+            if value is not None and not limit <= value <= 1e6:
+                raise CaptureError(f"{name} is {value}: give a number from {limit} to 1,000,000")
 
 
 @dataclass(frozen=True)

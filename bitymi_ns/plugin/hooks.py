@@ -23,8 +23,7 @@ from rich.panel import Panel
 from bitymi_ns import exit_messages
 from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import CONFIG, bundle_at
-from bitymi_ns.files import check_writable, write_errors_as
-from bitymi_ns.plugin.console import InputError, fail
+from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataparser import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.views import DATA
@@ -313,8 +312,7 @@ def patch_render() -> None:
         render.check_options(command)
     if kind == "ComputePSNR":
         command.output_path = WholeText(command.output_path)
-        with write_errors_as(command.output_path, InputError, render.OPTION):
-            check_writable(command.output_path)
+        render.check_evaluation(command)
     if kind == "DatasetRender":
         script["media"], script["gzip"] = SimpleNamespace(write_image=write_image), SimpleNamespace(open=open_gzip)
     if kind not in render.TRAJECTORIES:

@@ -32,6 +32,7 @@ def test_a_bundle_passes_as_it_was_written(made):
         "bundle.json", "atlas.ktx2", "surfels.ply", "contents", "tiles", "statistics", "certificate"
     ]  # fmt: skip
     assert main(["verify", str(folder)]) == 0
+    assert main(["verify", str(folder), "--views", "2"]) == 1  # of no run
 
 
 @pytest.mark.parametrize("drop", [True, False])

@@ -2,9 +2,11 @@
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from nerfstudio.scripts.eval import ComputePSNR
 from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.plugin.console import InputError
@@ -41,6 +43,26 @@ def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTra
     folder = a_run_of(trained, tmp_path)
     rewrite(folder, lambda config: setattr(config, "load_step", 7))  # of the run it resumed from
     assert eval_setup(folder / "config.yml")[3] == 59
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"output_path": Path("e")}, "--output-path must end in .json, e does not"),
+        (
+            {"render_output_path": Path(__file__)},
+            r"_runs.py is not a folder: .* \(--render-output-path\)",
+        ),
+    ],
+)
+def test_paths_that_cannot_be_written_are_refused_before_the_scene_is_loaded(
+    trained: BitymiTrainerConfig, options: Any, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("bitymi_ns.plugin.run.checkpoints.load", lambda *_: pytest.fail("the scene is loaded"))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=message):
+        ComputePSNR(load_config=trained.get_base_dir() / "config.yml", **options).main()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_near_plane_is_the_one_of_the_training(trained: BitymiTrainerConfig, tmp_path: Path) -> None:

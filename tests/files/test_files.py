@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -193,6 +194,47 @@ def test_a_read_only_and_a_full_disk(small_disk: Path) -> None:
     with pytest.raises(ValueError, match="the file system is read-only: write to another one"):
         with files.write_errors_as(small_disk / "b", ValueError):
             files.check_writable(small_disk / "b")
+
+
+OVERLAY = """
+set -e
+cd "$1"; mkdir -p lower/bundle/parts mounted; echo old > lower/bundle/x
+mount -t tmpfs none mounted; mkdir mounted/upper mounted/work mounted/seen
+mount -t overlay -o lowerdir=lower,upperdir=mounted/upper,workdir=mounted/work none mounted/seen
+exec "$2" -c "$3" "$1/mounted/seen/bundle"
+"""
+REPLACED = """
+import sys
+from pathlib import Path
+from bitymi_ns import files
+
+path = Path(sys.argv[1])
+with files.write_errors_as(path, SystemExit), files.complete_folder(path) if path.is_dir() else files.reserved(path):
+    raise SystemExit("the work has begun")
+"""
+
+
+def test_a_folder_of_a_lower_layer_is_refused_before_the_work(tmp_path: Path) -> None:
+    command = ["unshare", "-m", "bash", "-c", OVERLAY, "-", tmp_path, sys.executable, REPLACED]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.stderr.startswith(("mount: ", "unshare: ")):
+        pytest.skip("overlays cannot be mounted here")
+    assert "bundle cannot be written: it lies in a lower layer of an overlay" in done.stderr
+    assert (tmp_path / "lower/bundle/x").read_text() == "old\n"
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_what_its_attributes_protect_is_refused_before_the_work(kind: str, tmp_path: Path) -> None:
+    target = tmp_path / "a"
+    target.touch() if kind == "file" else target.mkdir()
+    if shutil.which("chattr") is None or subprocess.run(["chattr", "+i", target], capture_output=True).returncode:
+        pytest.skip("files cannot be made immutable here")
+    try:
+        done = subprocess.run([sys.executable, "-c", REPLACED, target], capture_output=True, text=True, check=False)
+        assert "a cannot be written: the system does not permit it, as after `chattr +i`" in done.stderr
+        assert names(tmp_path) == ["a"]
+    finally:
+        subprocess.run(["chattr", "-i", target], check=True)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le"])

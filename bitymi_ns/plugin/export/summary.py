@@ -7,7 +7,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from rich.table import Table
 
-from bitymi_ns.bundle.manifest import Manifest
+from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, Manifest
+from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.bundle.statistics import FineTuning, Percentiles
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.ops import VIEW_COLORS
@@ -45,14 +46,16 @@ def print_summary(folder: Path, info: Manifest) -> None:
     for name, learned in (("Polish", statistics.polish), ("Fine-tuning", statistics.finetune)):
         if learned is not None:
             print_tuning(table, name, learned)
-    size = sum(entry.bytes for entry in info.files.values()) / 1e6
-    table.add_row("Files", f"{size:.2f} MB in total")
+    size, held_out = download_bytes(folder, info), statistics.held_out
+    table.add_row("Files", f"{size / 1e6:.2f} MB in total, bundle.json included")
     others = statistics.rounding and statistics.rounding.alternatives
     if others:
-        found = (f"{size * ratio:.2g} MB {gain:+.2f} dB" for ratio, gain in others if gain is not None)
+        scene = sum(info.files[name].bytes for name in (COMPACT_SURFELS, TEXELS) if name in info.files)
+        sizes = ((size + scene * (ratio - 1)) / 1e6 for ratio, _ in others)
+        found = (f"{mb:.2g} MB {gain:+.2f} dB" for mb, (_, gain) in zip(sizes, others, strict=True) if gain is not None)
         table.add_row("... with --target-mb, about", ", ".join(found))
-        table.add_row("", "(training photographs, before fine-tuning, which makes the differences smaller)")
-    held_out = statistics.held_out
+        views = "training" if held_out is None else "held-out"
+        table.add_row("", f"({views} photographs, before fine-tuning, which makes the differences smaller)")
     if held_out is not None:
         table.add_row("Held-out views", f"{held_out.views}")
         table.add_row("Bundle against trained scene", decibels(held_out.psnr_baked_against_neural))

@@ -123,6 +123,10 @@ class BitymiTrainerConfig(TrainerConfig):
                     f"{option} is not supported: it scales the loss, and with it the gradients by which texels move "
                     "and surfels are densified. The kernels compute in single precision anyway; leave the option out"
                 )
+        for group, steps in self.gradient_accumulation_steps.items():
+            if steps < 1 or group not in PARAMETER_GROUPS:
+                known = ", ".join(PARAMETER_GROUPS)
+                fail(f"--gradient-accumulation-steps {group} {steps}: give at least 1 for one of {known}")
         asked, cards = self.machine.num_devices, torch.cuda.device_count()
         if self.machine.device_type == "cuda" and has_cuda_kernels() and asked > cards:
             fail(f"there are {cards} of {asked} GPUs that --machine.num-devices asks for")

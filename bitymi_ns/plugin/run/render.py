@@ -17,7 +17,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.utils import colormaps
 from torch import Tensor
 
-from bitymi_ns.files import reserved, size_text, write_errors_as
+from bitymi_ns.files import check_folder, check_writable, reserved, size_text, write_errors_as
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
@@ -45,6 +45,18 @@ def needs_no_photographs(command: Any) -> bool:
     if command.rendered_output_names is None:
         command.rendered_output_names = [name for name in OUTPUTS if name != "rgba"]
     return not any("gt-" in name for name in command.rendered_output_names)
+
+
+def check_evaluation(command: Any) -> None:
+    """Stop at paths of ns-eval that cannot be written."""
+    path, folder = command.output_path, command.render_output_path
+    if path.suffix != ".json":
+        fail(f"--output-path must end in .json, {path} does not.")
+    with write_errors_as(path, InputError, OPTION):
+        check_writable(path)
+    if folder is not None:
+        with write_errors_as(folder, InputError, " (--render-output-path)."):
+            check_folder(folder)
 
 
 def _spiral_frames(command: Any) -> int:
@@ -82,12 +94,21 @@ def check_options(command: Any) -> None:
             "them out. `ns-render dataset` writes photographs beside renders."
         )
     _check_outputs(command, not as_film and command.image_format == "png")
+    dataset = not hasattr(command, "output_format")
+    if not dataset and not Path(command.output_path).name:
+        fail(f"--output-path {str(command.output_path)!r} has no name of a {'film' if as_film else 'folder'}.")
     path = target_of(command)
     if as_film and path.suffix.lower() != ".mp4":
         fail(f"films are MP4: --output-path must end in .mp4, {path} does not. Frames: --output-format images.")
-    check = None if as_film else partial(check_frames, path) if hasattr(command, "output_format") else lambda: None
-    with write_errors_as(path, InputError, OPTION), reserved(path, check):
-        pass
+    with write_errors_as(path, InputError, OPTION):
+        if dataset:
+            check_folder(path)
+        else:
+            with reserved(path, None if as_film else partial(check_frames, path)):
+                pass
+    planes = command.depth_near_plane, command.depth_far_plane
+    if None not in planes:
+        _check_planes(*planes)
     if hasattr(command, "camera_path_filename"):
         path = read_camera_path(Path(command.camera_path_filename))
         if as_film and not RATES[0] <= path.rate <= RATES[1]:
@@ -95,6 +116,11 @@ def check_options(command: Any) -> None:
         command.camera_path_filename = path.written()
     elif getattr(command, "seconds", None) is not None and _spiral_frames(command) < 1:
         fail(f"{command.seconds} seconds have no frame at --frame-rate {command.frame_rate}: give more.")
+
+
+def _check_planes(near: float, far: float) -> None:
+    if not near < far:
+        fail(f"--depth-near-plane must be less than --depth-far-plane, and these are {near:.3g} and {far:.3g}.")
 
 
 def _check_outputs(command: Any, transparency: bool) -> None:
@@ -228,5 +254,7 @@ def _depth_planes(model: SurfelModel, views: Sequence[Any], command: Any) -> dic
     near, far = np.quantile(depths, (DEPTH_SHARE, 1 - DEPTH_SHARE)).tolist() if len(depths) else (0.0, 1.0)
     near = near if command.depth_near_plane is None else command.depth_near_plane
     far = far if command.depth_far_plane is None else command.depth_far_plane
+    if (command.depth_near_plane, command.depth_far_plane) != (None, None):
+        _check_planes(near, far)
     say(f"Depth colours span {near:.3g} to {far:.3g} units of the scene (--depth-near-plane, --depth-far-plane).")
     return {"near_plane": near, "far_plane": far}

@@ -64,7 +64,7 @@ def test_options_of_structure_from_motion_reach_it(project: Path, finder: list[A
 
 
 def test_options_of_structure_from_motion_that_cannot_be(project: Path, finder: list[Any]) -> None:
-    with expect("max_features is 1: give a number of at least 100"):
+    with expect("max_features is 1: give a number from 100 to 1,000,000"):
         load_any(project / "images", sfm=SfmSettings(max_features=1))
     with expect("--sfm is not for .*, which is read as colmap, but for photographs, video"):
         load_any(project, sfm=SfmSettings(max_features=4000))

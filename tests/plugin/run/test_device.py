@@ -81,6 +81,13 @@ def test_what_scales_the_loss_is_refused(config, option: str) -> None:
         config.set_timestamp()
 
 
+@pytest.mark.parametrize(("group", "steps"), [("means", 0), ("no-such-group", 2)])
+def test_gradients_are_accumulated_over_steps_of_known_groups(config, group: str, steps: int) -> None:
+    config.gradient_accumulation_steps = {group: steps}
+    with pytest.raises(SystemExit, match=f"--gradient-accumulation-steps {group} {steps}: give at least 1 for one of "):
+        config.set_timestamp()
+
+
 def test_no_card_and_other_devices(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     device._device_problem.cache_clear()

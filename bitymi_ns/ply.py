@@ -5,6 +5,7 @@ import re
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
@@ -124,18 +125,6 @@ def _row(properties: dict[str, str | None], order: str) -> np.dtype | None:
     return np.dtype(types) if len(types) == len(properties) else None
 
 
-def rows_there(path: Path, header: Header, name: str) -> int | None:
-    """Count the rows of an element that the file's size allows; None if the header does not determine it."""
-    element, ahead = header.elements[name], header.ahead(name)
-    if ahead is None:
-        return None
-    if not header.order:
-        return sum(1 for _ in text_lines(path, header, name))
-    if element.row is None:
-        return None
-    return max(0, path.stat().st_size - header.start - ahead) // max(1, element.row.itemsize)
-
-
 def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
     """Read the rows of an element, [count], a field per property.
 
@@ -150,12 +139,19 @@ def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
         with warnings.catch_warnings(), np.errstate(over="ignore"):
             warnings.simplefilter("error", DeprecationWarning)  # a fraction for an integer
             warnings.filterwarnings("ignore", "loadtxt", UserWarning)  # no lines
+            parse = partial(np.loadtxt, dtype=element.row, comments=None, ndmin=1)
             try:
-                rows = np.loadtxt(text, element.row, comments=None, ndmin=1)
-            except (ValueError, DeprecationWarning) as error:
-                raise PlyError(f"a line is no row of the element {name}: {error}") from error
+                rows = parse(text)
+            except (ValueError, DeprecationWarning):
+                for number, line in islice(text_lines(path, header, name), element.count):
+                    try:
+                        parse([line])
+                    except (ValueError, DeprecationWarning) as error:
+                        row = ", ".join(f"{one} ({element.row[one]})" for one in element.names)
+                        raise PlyError(f"line {number} is not {row[:200]}, but {line.strip()[:40]!r}") from error
+                raise
     else:
-        there = rows_there(path, header, name) or 0  # fromfile allocates before it reads
+        there = max(0, path.stat().st_size - header.start - ahead) // max(1, element.row.itemsize)  # fromfile allocates
         rows = np.fromfile(path, element.row, min(there, element.count), offset=header.start + ahead)
     if len(rows) < element.count:
         raise PlyError(f"it is cut off: it has {len(rows)} of {element.count} rows of the element {name}")

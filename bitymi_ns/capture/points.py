@@ -1,26 +1,25 @@
-"""Point clouds: validate and read PLY files, and color points by photographs.
+"""Point clouds: read PLY files, choose one, and color points by photographs.
 
 nerfstudio's PLY reader returns uninitialized memory for missing points, and divides all colors by 255, even those in
 [0, 1].
 """
 
-import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import lru_cache
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from bitymi_ns.capture.image_files import read_image
-from bitymi_ns.capture.types import Photograph, fail, say
-from bitymi_ns.ply import PlyError, read_header, read_rows, rows_there, text_lines
+from bitymi_ns.capture.types import CaptureError, Photograph, parsing, say
+from bitymi_ns.ply import read_header, read_rows
 from bitymi_ns.ranges import spread
 
+Array = npt.NDArray[np.float64]
 VERTEX = "vertex"
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of color properties in PLY files."""
@@ -28,6 +27,10 @@ MANY_POINTS = 500_000  # points from which on slow steps are announced and timed
 COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
 COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
+STEP = 0.1  # of the distance from a camera
+SAME = 0.5
+"""Least share of triangulated points on the surfaces of a cloud that is used: right ones have 0.6 to 0.95, others at
+most 0.4."""
 
 
 class Points(NamedTuple):
@@ -35,22 +38,6 @@ class Points(NamedTuple):
 
     xyz: npt.NDArray[np.float64]
     rgb: npt.NDArray[np.uint8]
-
-
-def read_points(path: Path) -> tuple[Points, str]:
-    """Read the points of a PLY file in which `ply_fault` finds none, and the reason, a clause, why they have no colors;
-    empty if they have. Raises PlyError: its points have list properties, or follow an element with some."""
-    header = read_header(path)
-    rows = read_rows(path, header, VERTEX)
-    xyz = np.stack([rows[name] for name in "xyz"], -1).astype(np.float64)
-    names = next((names for names in COLOR_NAMES if set(names) <= set(header.elements[VERTEX].names)), None)
-    if names is None:
-        return Points(xyz, np.zeros((0, 3), np.uint8)), "its points have none"
-    values = np.stack([rows[name] for name in names], -1)
-    if values.dtype == np.uint8:
-        return Points(xyz, values), ""
-    rgb, without = color_bytes(values.astype(np.float64), values.dtype.kind == "f")
-    return Points(xyz, rgb), without
 
 
 def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.NDArray[np.uint8], str]:
@@ -67,60 +54,6 @@ def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.ND
     return np.uint8(values * (255.0 / white) + 0.5), ""
 
 
-def ply_fault(path: Path) -> str | None:
-    """Describe why a file is no complete PLY file of points, in words that follow its name; None = it is."""
-    try:
-        header = read_header(path)
-        points = header.elements.get(VERTEX)
-        if points is None:
-            return f"declares no points (element {VERTEX})"
-        missing = [name for name in "xyz" if name not in points.names]
-        if missing:
-            return f"gives no {' and no '.join(missing)} of its points (property float {missing[0]})"
-        there = rows_there(path, header, VERTEX)
-        if there is not None and there < points.count:
-            return f"is cut off: it has {there} of {points.count} points"
-        line = _bad_line(path, path.stat().st_mtime_ns)
-    except PlyError as error:
-        return f"is {error}" if str(error).startswith("not ") else f"is damaged, no points can be read: {error}"
-    except OSError as error:
-        return f"cannot be read: {error}"
-    return None if line is None else f"is damaged: {line}"
-
-
-@lru_cache(maxsize=2)  # captures are checked twice, which takes seconds for large clouds
-def _bad_line(path: Path, changed: int) -> str | None:
-    """Describe the fault of a text file's first line that is no point; None = none."""
-    header = read_header(path)
-    points = header.elements[VERTEX]
-    if header.order or points.row is None or not points.count:
-        return None
-    try:
-        values = read_rows(path, header, VERTEX)
-        if not any(np.isinf(values[name]).any() for name in points.names):
-            return None
-    except PlyError:
-        pass
-    types = [points.row[name] for name in points.names]
-    for number, line in islice(text_lines(path, header, VERTEX), points.count):
-        words = line.split()
-        if len(words) != len(types):
-            return f"line {number} has {len(words)} numbers, but its points have {len(types)}"
-        for word, name, kind in zip(words, points.names, types, strict=True):
-            if not _fits(word, kind):
-                return f"line {number} has {word[:30]!r} for {name}, which is no number of that kind ({kind.name})"
-    return None
-
-
-def _fits(word: str, kind: np.dtype) -> bool:
-    try:
-        if kind.kind == "f":
-            return not abs(float(word)) > float(np.finfo(kind).max)
-        return np.iinfo(kind).min <= int(word) <= np.iinfo(kind).max
-    except ValueError:
-        return False
-
-
 @contextmanager
 def reporting_time(what: str, points: int) -> Iterator[None]:
     """Announce and time a step on many points."""
@@ -134,15 +67,54 @@ def reporting_time(what: str, points: int) -> Iterator[None]:
 
 
 def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
-    """Read a PLY file, see `read_points`. Raises CaptureError: it is missing, or cannot be read; `remedy` says what to
-    do."""
-    fault = ply_fault(path) if os.path.isfile(path) else "does not exist"
-    if fault is not None:
-        fail(f"the point cloud {path} {fault}. {remedy}")
-    try:
-        return read_points(path)
-    except PlyError as error:
-        fail(f"the point cloud {path} cannot be read: {error}. Write its points without lists.", error)
+    """Read the points of a PLY file, and the reason, a clause, why they have no colors; empty if they have. Raises
+    CaptureError: it is missing, or cannot be read; `remedy` says what to do."""
+    with parsing(f"the point cloud {path}", remedy):
+        header = read_header(path)
+        points = header.elements.get(VERTEX)
+        names = () if points is None else points.names
+        if missing := [name for name in "xyz" if name not in names]:
+            raise ValueError(f"it gives no {' and no '.join(missing)} of its points (property float {missing[0]})")
+        rows = read_rows(path, header, VERTEX)
+    xyz = np.stack([rows[name] for name in "xyz"], -1).astype(np.float64)
+    colors = next((each for each in COLOR_NAMES if set(each) <= set(names)), None)
+    if colors is None:
+        return Points(xyz, np.zeros((0, 3), np.uint8)), "its points have none"
+    values = np.stack([rows[name] for name in colors], -1)
+    if values.dtype == np.uint8:
+        return Points(xyz, values), ""
+    rgb, without = color_bytes(values.astype(np.float64), values.dtype.kind == "f")
+    return Points(xyz, rgb), without
+
+
+def share_on(cloud: Array, points: Array, centers: Array) -> float:
+    """Measure the share of points [N, 3] on surfaces that a cloud [M, 3] shows: it lies nearer to them than to where
+    they are by STEP nearer to, or farther from, the nearest of the cameras [K, 3]. By chance a third."""
+    tree = cKDTree(cloud[np.isfinite(cloud).all(1)])
+    step = STEP * (centers[cKDTree(centers).query(points)[1]] - points)
+    here, nearer, farther = (tree.query(points + sign * step)[0] for sign in (0.0, 1.0, -1.0))
+    return float((here < np.minimum(nearer, farther)).mean())
+
+
+def cloud_beside(
+    folder: Path, found: Points | None, photographs: Sequence[Photograph], read: Callable[[Path], Points]
+) -> Points | None:
+    """Choose a PLY file in a folder that nothing names: the first with most points of surfaces on its own, of those
+    `found` by triangulation; None = none. Say why others are not used."""
+    centers = np.stack([each.pose[:3, 3] for each in photographs])
+    for path in sorted(folder.glob("*.ply")):
+        try:
+            cloud = read(path)
+        except CaptureError as error:
+            say(f"Not used: {error}")
+            continue
+        share = 0.0 if found is None or not len(cloud.xyz) else share_on(cloud.xyz, found.xyz, centers)
+        why = f"{share:.0%} of the triangulated points lie on its surfaces"
+        if share > SAME:
+            say(f"Training starts from the points of {path}, which nothing names: {why}.")
+            return cloud
+        say(f"{path}, which nothing names, is not used: {why}. `bitymi-data --ply-path {path.name}` uses it.")
+    return None
 
 
 def with_colors(points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:

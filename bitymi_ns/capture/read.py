@@ -4,6 +4,7 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -14,7 +15,7 @@ from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_p
 from bitymi_ns.capture.find_files import check_photographs_exist, name_unused
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.masks import check_masks, with_masks
-from bitymi_ns.capture.points import Points, read_cloud, with_colors
+from bitymi_ns.capture.points import Points, cloud_beside, read_cloud, with_colors
 from bitymi_ns.capture.pose_checks import fit_scale
 from bitymi_ns.capture.readings import AUTO, WRITTEN, Reading, as_meant
 from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
@@ -34,7 +35,6 @@ OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
     "masks_path": ("colmap", "photographs"),
-    "ply_path": ("blender",),
     "alpha_color": ("blender",),
     **dict.fromkeys(("scene_scale", "orientation_method", "center_method", "auto_scale_poses"), FRAMED),
     "scale_factor": (*FRAMED, "blender"),
@@ -84,7 +84,7 @@ class CaptureOptions(SplitOptions, FrameOptions):
     their folder or in that of the data."""
     use_masks: bool = True  # Use the masks of the capture: those that it names, or those beside its photographs.
     colmap_path: Path | None = None  # Folder of the COLMAP model, relative to --data; None = find it.
-    ply_path: Path | None = None  # Points of a Blender data set, a PLY file relative to --data; None = see --points.
+    ply_path: Path | None = None  # PLY file of points to start from, relative to --data; None = see --points.
     points: Choice = "auto"
     """Points to start from: those of the capture, else triangulated ones (auto); triangulated ones in any case; or
     random ones."""
@@ -296,14 +296,10 @@ class _Reader:
             numbers[name] = range(start, start + len(part))
             start += len(part)
         used = every[: len(train.photographs)]
-        own = None
-        if options.ply_path is not None and options.points == "auto":
-            hint = "Put it there again, or leave --ply-path out to start from random points."
-            own = self._cloud(found.path / options.ply_path, hint, used)
         frame = FrameOptions(options.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
         if options.scale_factor == 1.0:  # else the user has chosen it
             frame = fit_scale(frame, used, source)
-        points = self._points(own, used, source)
+        points = self._points(None, used, source)
         return Capture(found.format, source, every, points, frame, parts=numbers, downscale=self.downscale)
 
     def _check(self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None] | None) -> None:
@@ -334,14 +330,21 @@ class _Reader:
         return with_colors(points, without, photographs, source) if self.want_points else points
 
     def _points(self, own: Points | None, photographs: Sequence[Photograph], source: str) -> Points | None:
-        """Choose the points to start from: the capture's `own`, else triangulated ones, which its folder caches; None =
-        random ones. `source` of the poses is for messages."""
+        """Choose the points to start from: of --ply-path, the capture's `own`, those of a PLY file beside it that shows
+        the same surfaces as triangulated ones, or these, which its folder caches; None = random ones. `source` of the
+        poses is for messages."""
+        auto, folder = self.options.points == "auto", self.found.folder
         if self.options.points == "random":
             return None
-        if own is not None and len(own.xyz) and self.options.points == "auto":
+        if auto and self.options.ply_path is not None:
+            hint = "Put it there again, or leave --ply-path out."
+            return self._cloud(folder / self.options.ply_path, hint, photographs)
+        if auto and own is not None and len(own.xyz):
             return own
         if not self.want_points:
             return None
         from bitymi_ns.capture.known_poses import triangulated  # slow to import, and seldom needed
 
-        return triangulated(photographs, self.found.folder, source)
+        found = triangulated(photographs, folder, source)
+        read = partial(self._cloud, remedy="", photographs=photographs)
+        return (cloud_beside(folder, found, photographs, read) if auto else None) or found

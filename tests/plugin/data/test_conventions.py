@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from bitymi_ns import load_capture
 from bitymi_ns.capture import readings
-from bitymi_ns.capture.points import read_points
+from bitymi_ns.capture.points import read_cloud
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.run.config import method_config
 from bitymi_ns.ply import write_cloud
@@ -134,7 +134,7 @@ def test_a_left_handed_world_is_mirrored_with_its_cloud(capture: Path) -> None:
     right = load_any(capture, poses_as="written").train_dataparser_outputs
     of_json(capture, lambda pose: MIRROR @ pose @ MIRROR)
     cloud = capture / "sparse_pc.ply"
-    points = read_points(cloud)[0]
+    points = read_cloud(cloud, "")[0]
     write_cloud(cloud, points.xyz * (1, 1, -1), points.rgb)
     found = load_any(capture).train_dataparser_outputs
     assert decided() == "left-handed-c2w"

@@ -10,14 +10,14 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture import known_poses
-from bitymi_ns.capture.points import read_points
+from bitymi_ns.capture.points import read_cloud
 from bitymi_ns.capture.types import Photograph
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.sample.capture import camera_path, render
 from bitymi_ns.sample.room import Room
 from tests.captures import edit, edit_frames, load_any, printed, write_cloud
-from tests.formats import PHOTOGRAPHS, blender, colmap
+from tests.formats import PHOTOGRAPHS, blender, colmap, nerfstudio
 from tests.plugin.data.test_true_captures import move
 
 SIZE = (200, 150)
@@ -138,8 +138,33 @@ def test_triangulated_points_instead_of_those_of_the_capture(capture: Path, form
     assert len(asked) == before + 1
 
 
+@pytest.mark.parametrize("form", [nerfstudio, blender])
+def test_a_cloud_that_nothing_names(
+    capture: Path, form: Any, asked: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The triangulated points lie on a plane."""
+    place = form(capture)
+    edit(place, lambda meta: meta.pop("ply_file_path", None))
+    (capture / "sparse_pc.ply").unlink()
+    middle = np.mean([frame["transform_matrix"] for frame in json.loads(place.read_text())["frames"]], 0)[:3, 3]
+    grid = np.linspace(-1, 1, 21)  # triangulated points are made relative to the cameras' middle
+    right, other = (np.stack(np.meshgrid(grid, grid, [z]), -1).reshape(-1, 3) + middle for z in (0.5, 0.6))
+    (capture / "a.ply").write_text("ply\n")
+    write_cloud(capture / "b.ply", other)
+    assert len(load_any(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
+    text = printed(capsys)
+    assert f"Not used: the point cloud {capture}/a.ply cannot be read: not a PLY file." in text
+    assert f"{capture}/b.ply, which nothing names, is not used: 0% of the triangulated points lie" in text
+    write_cloud(capture / "c.ply", right)
+    assert len(load_any(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 441
+    assert f"Training starts from the points of {capture}/c.ply, which nothing names: 100% of" in printed(capsys)
+    given = load_any(capture, ply_path=Path("b.ply")).train_dataparser_outputs.metadata["points3D_xyz"]
+    assert len(given) == 441 and "nothing names" not in printed(capsys)
+    assert len(load_any(capture, points="triangulate").train_dataparser_outputs.metadata["points3D_xyz"]) == 2
+
+
 def test_points_without_colors_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points = read_points(capture / "sparse_pc.ply")[0].xyz
+    points = read_cloud(capture / "sparse_pc.ply", "")[0].xyz
     with_colors = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
     write_cloud(capture / "sparse_pc.ply", points, None)
     found = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()

@@ -1,16 +1,17 @@
-"""Truncated point clouds of every format."""
+"""Point clouds: whole and damaged ones of every form, and their colours."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.capture.points import ply_fault, read_points
+from bitymi_ns.capture.points import read_cloud
 from bitymi_ns.plugin.run.model import new_scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
-from tests.captures import load, printed
+from tests.captures import load, printed, refused
 
 HEADER = (
     "ply\nformat {}\ncomment by hand\nelement vertex {}\n"
@@ -19,62 +20,59 @@ HEADER = (
 BINARY = "binary_little_endian 1.0"
 
 
-def write(path: Path, body: bytes, format: str = BINARY, count: object = 3, further: str = "") -> Path:
-    path.write_bytes(HEADER.format(format, count, further).encode() + body)
+TEXT = "ascii 1.0"
+
+
+def write(path: Path, body: bytes, format: str = BINARY, count: object = 3, further: str = "", ahead: str = "") -> Path:
+    header = HEADER.replace("element vertex", f"{ahead}element vertex").format(format, count, further)
+    path.write_bytes(header.encode() + body)
     return path
 
 
 def test_whole_clouds(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    assert ply_fault(write(path, bytes(45))) is None
-    assert ply_fault(write(path, b"", count=0)) is None
-    assert ply_fault(write(path, b"1.5 2 3 4\n3 4 5 nan\n\n5 6 7 8", "ascii 1.0")) is None
     faces = "element face 1\nproperty list uchar int vertex_indices\n"
-    assert ply_fault(write(path, bytes(45 + 13), further=faces)) is None
-    assert ply_fault(write(path, b"", further="property list uchar int tags\n")) is None  # left to the reader
-
-
-@pytest.mark.parametrize(("body", "format", "there"), [(bytes(44), BINARY, 2), (b"1 2 3 4\n5 6 7 8\n", "ascii 1.0", 2)])
-def test_clouds_that_are_cut_off(tmp_path: Path, body: bytes, format: str, there: int) -> None:
-    assert ply_fault(write(tmp_path / "a.ply", body, format)) == f"is cut off: it has {there} of 3 points"
+    ahead = "element camera 2\nproperty float f\n"
+    for count, *written in (
+        (3, bytes(45)), (0, b"", BINARY, 0), (3, b"1.5 2 3 4\n3 4 5 nan\n\n5 6 7 8", TEXT),
+        (3, b"1e39 2 3 4\n" * 3, TEXT), (3, bytes(45 + 13), BINARY, 3, faces),
+        (3, bytes(8 + 45), BINARY, 3, "", ahead), (3, b"1\n2\n" + 3 * b"1 2 3 4\n", TEXT, 3, "", ahead),
+    ):  # fmt: skip
+        points, without = read_cloud(write(path, *written), "")
+        assert points.xyz.shape == (count, 3) and without == "its points have none"
 
 
 @pytest.mark.parametrize(
-    ("line", "message"),
+    ("written", "message"),
     [
-        ("1 2 3", "is damaged: line 12 has 3 numbers, but its points have 4"),
-        ("1 2 3 4 5", "is damaged: line 12 has 5 numbers, but its points have 4"),
-        ("hello 2 3 4", "is damaged: line 12 has 'hello' for x, which is no number of that kind (float32)"),
-        ("1e39 2 3 4", "is damaged: line 12 has '1e39' for x, which is no number of that kind (float32)"),
-        ("1 2.5 3 4", "is damaged: line 12 has '2.5' for y, which is no number of that kind (int16)"),
-        ("1 2 200 4", "is damaged: line 12 has '200' for z, which is no number of that kind (int8)"),
+        ((bytes(44),), "it is cut off: it has 2 of 3 rows of the element vertex"),
+        ((bytes(8 + 44), BINARY, 3, "", "element camera 2\nproperty float f\n"), "it is cut off: it has 2 of 3 rows"),
+        ((b"1 2 3 4\n5 6 7 8\n", TEXT), "it is cut off: it has 2 of 3 rows"),
+        *(((f"1 2 3 4\n\n{line}\n1 2 3 4\n".encode(), TEXT), rf"line 12 is not x .*, but '{line}'")
+          for line in ("1 2 3", "1 2 3 4 5", "hello 2 3 4", "1 2.5 3 4", "1 2 200 4")),
+        ((b"", BINARY, 3, "property list uchar int tags\n"), "the element vertex have lists, or stand behind some"),
+        ((b"", BINARY, "many"), "the count 'many' of the element vertex is not a number"),
     ],
-)
-def test_a_line_in_the_middle_that_is_no_point(tmp_path: Path, line: str, message: str) -> None:
-    body = f"1 2 3 4\n\n{line}\n1 2 3 4\n"
-    assert ply_fault(write(tmp_path / "a.ply", body.encode(), "ascii 1.0")) == message
-
-
-def test_points_behind_another_element(tmp_path: Path) -> None:
-    path = tmp_path / "a.ply"
-    whole = HEADER.replace("element vertex", "element camera 2\nproperty float f\nelement vertex")
-    for format, body in ((BINARY, bytes(8 + 45)), ("ascii 1.0", b"1\n2\n" + 3 * b"1 2 3 4\n")):
-        path.write_bytes(whole.format(format, 3, "").encode() + body)
-        assert ply_fault(path) is None
-        path.write_bytes(path.read_bytes()[:-8])
-        assert ply_fault(path) == "is cut off: it has 2 of 3 points"
+)  # fmt: skip
+def test_damaged_clouds(tmp_path: Path, written: tuple[Any, ...], message: str) -> None:
+    with refused(f"the point cloud .*a.ply cannot be read: .*{message}.*Do this."):
+        read_cloud(write(tmp_path / "a.ply", *written), "Do this.")
 
 
 def test_other_files(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
     for data in (b"", b"ply", b"hello", b"ply\nend_header"):
         path.write_bytes(data)
-        assert ply_fault(path) == "is not a PLY file"
-    assert "no points" in str(ply_fault(write(path, b"", count="many")))
-    assert "the count 'many' of the element vertex is not a number" in str(ply_fault(path))
-    assert "cannot be read" in str(ply_fault(tmp_path))
+        with refused("a.ply cannot be read: not a PLY file"):
+            read_cloud(path, "")
     path.write_bytes(write(path, bytes(45)).read_bytes().replace(b" z\n", b" q\n"))
-    assert ply_fault(path) == "gives no z of its points (property float z)"
+    for file, message in (
+        (tmp_path, "it is not a regular file"),
+        (tmp_path / "gone.ply", "it does not exist"),
+        (path, r"it gives no z of its points \(property float z\)"),
+    ):
+        with refused(f"cannot be read: {message}"):
+            read_cloud(file, "")
 
 
 def test_a_handful_of_points_is_doubted(capsys: pytest.CaptureFixture[str]) -> None:
@@ -111,12 +109,12 @@ def colored(path: Path, kind: str, values: np.ndarray, format: str) -> Path:
 def test_colors_that_are_no_bytes(tmp_path: Path, format: str, kind: str, white: int) -> None:
     bytes_of = np.uint8([[0, 128, 255], [7, 66, 200]])
     values = bytes_of * (white / 255) if kind != "ushort" else bytes_of.astype(int) * 257
-    points, without = read_points(colored(tmp_path / "a.ply", kind, values, format))
+    points, without = read_cloud(colored(tmp_path / "a.ply", kind, values, format), "")
     assert np.array_equal(points.rgb, bytes_of) and not without
 
 
 def test_colors_of_unknown_scale(tmp_path: Path, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points, without = read_points(write(tmp_path / "a.ply", bytes(45)))
+    points, without = read_cloud(write(tmp_path / "a.ply", bytes(45)), "")
     assert len(points.rgb) == 0 and without == "its points have none"
     colored(capture / "sparse_pc.ply", "float", np.float32([[-1, 0, 2000]] * 9), "ascii")
     load(capture)

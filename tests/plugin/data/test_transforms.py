@@ -131,7 +131,7 @@ def test_a_point_cloud_by_its_name_on_another_machine(capture: Path, name: str) 
     if "points" in name:
         assert len(load_any(capture).train_dataset.metadata["points3D_xyz"]) == 200
     else:  # it is in no such folder
-        with expect("the point cloud .* does not exist"):
+        with expect("the point cloud .* cannot be read: it does not exist"):
             load_any(capture)
 
 

@@ -266,7 +266,7 @@ def test_points_of_a_model_in_a_ply_file_alone(project: Path, empty: str | None)
     metadata = load_any(project).train_dataparser_outputs.metadata
     assert metadata["points3D_rgb"].tolist() == [[200, 10, 10]] * 2
     path.write_text("\n".join(path.read_text().splitlines()[:-2]) + "\n")
-    with expect("the point cloud .*points3D.ply is cut off: it has 0 of 2 points"):
+    with expect("the point cloud .*points3D.ply cannot be read: it is cut off: it has 0 of 2 rows"):
         load_any(project)
 
 

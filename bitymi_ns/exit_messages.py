@@ -27,13 +27,15 @@ _CAUSES = {
     errno.EISDIR: "it is a folder: give a file",
     errno.EEXIST: "it is there already: choose another path",
 }
-_NO_MEMORY = re.compile(r"DefaultCPUAllocator|out of memory|bad_alloc|ALLOC_FAILED|\(-4:Insufficient memory\)")
+_NO_MEMORY = re.compile(
+    r"DefaultCPUAllocator|out of memory|bad_alloc|ALLOC_FAILED|\(-4:Insufficient memory\)|Cannot allocate memory"
+)
 
 _then: Callable[[], str] = str  # see `install`
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Return True for a MemoryError, and for the errors that torch, CUDA and OpenCV raise in its place."""
+    """Return True for a MemoryError, and for the errors that torch, CUDA, OpenCV and the system raise in its place."""
     return isinstance(error, MemoryError) or isinstance(error, Exception) and _NO_MEMORY.search(str(error)) is not None
 
 

@@ -99,7 +99,7 @@ def why(error: BaseException) -> str:
     if isinstance(error, KeyError):
         return f"the entry {error} is missing"
     if out_of_memory(error):
-        return "it declares more than memory holds"
+        return "it takes more memory than there is"
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, OverflowError):
@@ -121,7 +121,7 @@ def reading(
     Args:
         what: file and entry being read, as in "a.json: frame 3".
         refuse: raises the exception for a message and its cause.
-        advice: end of the message: what to do.
+        advice: end of the message: what to do, unless memory ran out.
         passing: exceptions with such a message, which are passed on.
     """
     try:
@@ -129,4 +129,5 @@ def reading(
     except passing:
         raise
     except Exception as error:
-        refuse(f"{what} cannot be read: {why(error)}.{' ' + advice if advice else ''}", error)
+        then = "End other programs, or make it smaller." if out_of_memory(error) else advice
+        refuse(f"{what} cannot be read: {why(error)}.{' ' + then if then else ''}", error)

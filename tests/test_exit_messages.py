@@ -5,12 +5,22 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NoReturn
+from unittest.mock import Mock
 
 import pytest
+from nerfstudio.pipelines.base_pipeline import VanillaPipeline
+from PIL import Image
 
 from bitymi_ns import exit_messages
+from bitymi_ns.capture import known_poses, sfm_photos
+from bitymi_ns.measure.report import pictures
+from bitymi_ns.plugin.run.trainer import BitymiPipeline
+from bitymi_ns.safe_reading import reading
 from bitymi_ns.trust import python_command
 
 BITYMI = python_command("bitymi_ns.__main__", "main")
@@ -62,6 +72,8 @@ def test_ctrl_c_in_the_first_second(after: float) -> None:
         ("MemoryError()", "bitymi: there is not enough memory for this"),
         ("RuntimeError('[enforce] DefaultCPUAllocator: not enough memory')", "bitymi: there is not enough memory"),
         ("RuntimeError('CUDA out of memory. Tried to allocate 2 GiB')", "bitymi: there is not enough memory"),
+        ("OSError(12, 'Cannot allocate memory')", "bitymi: there is not enough memory"),
+        ("ImportError('a.so: cannot map it: Cannot allocate memory')", "bitymi: there is not enough memory"),
         ("OSError(13, 'Permission denied', 'a')", "bitymi: a cannot be read or written: you have no permission for"),
         ("OSError(2, 'No such file', 'a')", "bitymi: a cannot be read or written: it does not exist: check the path"),
     ],
@@ -72,6 +84,41 @@ def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stderr.startswith(line) and done.stderr.count("\n") == 1
     assert done.returncode in (1, -signal.SIGINT)  # shells show 130
+
+
+def _read(path: Path) -> None:
+    def refuse(line: str, error: BaseException) -> NoReturn:
+        raise ValueError(line) from error
+
+    with reading(path, refuse, "It is damaged."):
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory")
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "read"),
+    [
+        (sfm_photos, "open_picture", lambda path: sfm_photos.read_photo(path.parent, path.name)),
+        (
+            known_poses,
+            "open_picture",
+            lambda path: known_poses._job(["a"], [SimpleNamespace(file=path)], [], path.parent),
+        ),
+        (Image, "open", pictures.open_image),
+        (VanillaPipeline, "load_pipeline", lambda _: BitymiPipeline.__new__(BitymiPipeline).load_pipeline({}, 3)),
+        (sfm_photos, "open_picture", _read),
+    ],
+)
+def test_files_are_not_blamed_for_a_lack_of_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, owner: object, name: str, read: Callable[[Path], object]
+) -> None:
+    (tmp_path / "a.jpg").write_bytes(b"")
+    raised = RuntimeError("CUDA out of memory") if owner is VanillaPipeline else MemoryError()
+    monkeypatch.setattr(owner, name, Mock(side_effect=raised))
+    with pytest.raises((MemoryError, RuntimeError, ValueError)) as stop:
+        read(tmp_path / "a.jpg")
+    assert stop.value is raised or str(stop.value).endswith(
+        "a.jpg cannot be read: it takes more memory than there is. End other programs, or make it smaller."
+    )
 
 
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGHUP])

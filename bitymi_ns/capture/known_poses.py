@@ -99,6 +99,8 @@ def _job(stated: Sequence[str], views: Sequence[Photograph], poses: list[list[li
         try:
             with open_picture(view.file) as image:
                 converted = None if is_plain(image, view.file) else in_srgb(eight_bits(image)).convert("RGB")
+        except MemoryError:
+            raise
         except Exception as error:
             raise CaptureError(f"{view.file} cannot be read as a picture: save it again") from error
         plain = f"{i:06d}{suffix if converted is None else '.png'}"

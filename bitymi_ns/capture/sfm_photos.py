@@ -113,7 +113,7 @@ def read_photo(folder: Path, name: str) -> Photo:
             if image.format != "JPEG":  # Pillow turns TIFF by itself, and changes its size
                 width, height = grey.size
             frames = getattr(image, "n_frames", 1)
-    except CaptureError:
+    except (CaptureError, MemoryError):
         raise
     except Image.DecompressionBombError as error:
         raise CaptureError("it has too many pixels to be a photograph") from error

@@ -89,7 +89,8 @@ def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
                 try:
                     f = _with_members(f, commands())
                 except Exception as error:  # noqa: BLE001 - nerfstudio's own commands have to go on working
-                    warnings.warn(f"bitymi-ns: `ns-export {COMMAND}` is not available: {error}", stacklevel=2)
+                    cause = exit_messages.line_of(error) or error
+                    warnings.warn(f"bitymi-ns: `ns-export {COMMAND}` is not available: {cause}", stacklevel=2)
             return tyro.cli(f, *args, **options)
 
         module.tyro = SimpleNamespace(**{**vars(tyro), "cli": cli})  # type: ignore[union-attr]

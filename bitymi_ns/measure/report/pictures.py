@@ -64,7 +64,7 @@ def open_image(path: Path) -> Image.Image:
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as opened:
             return opened.convert("RGBA" if "A" in opened.getbands() or "transparency" in opened.info else "RGB")
-    except OSError:
+    except (OSError, MemoryError):
         raise
     except Exception as error:  # Pillow raises many kinds on broken files
         raise OSError(str(error)) from error

@@ -21,7 +21,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 
-from bitymi_ns import files
+from bitymi_ns import exit_messages, files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.hooks import filter_console, ignore_torch_warnings
@@ -220,6 +220,8 @@ class BitymiPipeline(VanillaPipeline):
         try:
             super().load_pipeline(loaded_state, step)
         except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
+            if exit_messages.out_of_memory(error):
+                raise
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
         if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # in training the callbacks do this
             return

@@ -1,4 +1,4 @@
-"""Photographs of a COLMAP model: find image and mask files, and convert poses and points to nerfstudio's frame."""
+"""Photographs of a COLMAP model: find their files, and convert poses and points to nerfstudio's frame."""
 
 import os
 from collections import Counter
@@ -13,10 +13,10 @@ from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.capture.find_files import FileFinder, renamed_message
 from bitymi_ns.capture.folder_contents import photographs_below, photographs_in, result_in
-from bitymi_ns.capture.masks import LEAVE_OUT, USUAL_FOLDERS, downscaled_masks, mask_folder, masks_named
+from bitymi_ns.capture.masks import USUAL_FOLDERS
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.recognise import Found
-from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, Photograph, Pose, SfmSettings, fail, say, warn
+from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -39,7 +39,6 @@ class Source:
 
     folder: Path  # of the model
     photographs: Path  # folder to which names in the model are relative
-    masks: Path | None = None  # folder of masks; None = none
     downscale: int = 1  # factor by which photographs are reduced
     copies: Path | None = None  # folder of reduced copies; None = reduce photographs on reading
     left_out: Mapping[str, str] = field(default_factory=dict)  # photographs that the model lacks, and known reasons
@@ -70,31 +69,24 @@ class Source:
         cameras = " and ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         text = f"COLMAP model {self.folder} ({len(model.images)} photographs, {cameras} camera"
         text += f"{'s' if len(used) > 1 else ''}, {len(model.xyz):,} points), photographs {self.image_folder}"
-        if self.masks is not None:
-            text += f", masks {self.masks} ({LEAVE_OUT})"
         if self.downscale > 1 and self.copies is None:
             text += f", reduced {self.downscale} times as they are read"
         return text
 
 
-def find_source(found: Found, images: Path | None, masks: Path | None, downscale: int, need_photos: bool) -> Source:
-    """Find the photographs and masks of a COLMAP model: at stated paths in the capture, else by searching it."""
+def find_source(found: Found, images: Path | None, downscale: int, need_photos: bool) -> Source:
+    """Find the photographs of a COLMAP model: at a stated path in the capture, else by searching it."""
     names = [image.name for image in read_model(found.path).images]
     photographs = _find_folder(names, found.path, found.folder, images, downscale, need_photos)
-    masks = find_masks(photographs, found.folder, masks, downscale)
-    return make_source(found.path, photographs, masks, downscale, {})
+    return make_source(found.path, photographs, downscale, {})
 
 
-def make_source(
-    folder: Path, photographs: Path, masks: Path | None, downscale: int, left_out: Mapping[str, str]
-) -> Source:
-    """Make a source of known folders, with downscaled copies (`images_2`, `masks_2`) if there are any."""
+def make_source(folder: Path, photographs: Path, downscale: int, left_out: Mapping[str, str]) -> Source:
+    """Make a source of known folders, with downscaled copies (`images_2`) if there are any."""
     smaller = photographs.with_name(f"{photographs.name}_{downscale}")
-    copies = smaller if downscale > 1 and smaller.is_dir() else None
-    if masks is not None and downscale > 1 and (copies is not None or not masks.is_dir()):
-        small = downscaled_masks(masks, downscale)
-        masks = small if small.is_dir() else masks  # reduced on reading
-    return Source(folder, photographs, masks, downscale, copies, dict(left_out))
+    return Source(
+        folder, photographs, downscale, smaller if downscale > 1 and smaller.is_dir() else None, dict(left_out)
+    )
 
 
 def _find_folder(
@@ -151,18 +143,6 @@ def _find_folder(
     return best
 
 
-def find_masks(photographs: Path, capture: Path, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks as `mask_folder` does; `stated` is relative to the capture.
-
-    Raises:
-        CaptureError: neither the stated one nor its reduced one exists.
-    """
-    try:
-        return mask_folder(photographs, capture, None if stated is None else capture / stated, downscale)
-    except CaptureError as error:
-        fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
-
-
 def _name_in(folder: Path, path: Path) -> str:
     return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
 
@@ -185,17 +165,13 @@ def warn_left_out(source: Source) -> set[Path]:
     return {*files, *(source.photographs / name for name in names)}
 
 
-def photographs_of(source: Source, need_photos: bool) -> list[Photograph]:
+def photographs_of(source: Source) -> list[Photograph]:
     """List the photographs of a model in the order of their names, with cameras and poses."""
-    model, files = source.model, source.files()
-    masks = None
-    if need_photos and source.masks is not None:
-        masks = masks_named(source.masks, [_name_in(source.image_folder, path) for path in files])
-    found = []
-    for i, (image, file) in enumerate(zip(model.images, files, strict=True)):
+    model, found = source.model, []
+    for image, file in zip(model.images, source.files(), strict=True):
         camera, pose = model.cameras[image.camera_id], TO_Z_UP @ _camera_to_world(image)
-        label, mask = f"camera {image.camera_id} of {source.folder}", None if masks is None else masks[i]
-        found.append(Photograph(file, camera, pose, label, mask, source.copies is not None, image.frame))
+        label = f"camera {image.camera_id} of {source.folder}"
+        found.append(Photograph(file, camera, pose, label, None, source.copies is not None, image.frame))
     return found
 
 

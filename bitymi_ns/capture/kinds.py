@@ -21,13 +21,15 @@ class Kind:
     mark: bytes = b""  # that the file holds
 
 
+DYNAMIC = Kind("dynamic_mask_NAME", "a mask of instant-ngp", "NAME")
+MASK = Kind("NAME.mask NAME_mask NAME-mask", "a mask", "NAME")
 PICTURES = (
     Kind("thumb thumb_[0-9]* thumbnail thumbnail_[0-9]*", "a thumbnail"),
     Kind("material_0 textured_output", "a texture"),
     Kind("depth_[0-9]* *[._-]depth", "a depth map"),
     Kind("conf_[0-9]*", "a confidence map"),
-    Kind("dynamic_mask_NAME", "a mask of instant-ngp", "NAME"),
-    Kind("NAME[._-]mask", "a mask", "NAME"),
+    DYNAMIC,
+    MASK,
     Kind("NAME[._-]masked NAME[._-]undistorted", "a copy", "NAME"),
     Kind("NAME_ms_g NAME_ms_r NAME_ms_re NAME_ms_nir", "another band", "NAME_d"),
     Kind("NAME_gre NAME_red NAME_reg NAME_nir", "another band", "NAME_rgb"),

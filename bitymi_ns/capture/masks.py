@@ -3,17 +3,17 @@
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePath
 
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.folder_contents import open_picture
+from bitymi_ns.capture.folder_contents import is_picture, open_picture
 from bitymi_ns.capture.image_files import has_transparency, image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.kinds import PHOTOGRAPHS
+from bitymi_ns.capture.kinds import DYNAMIC, MASK, PHOTOGRAPHS
 from bitymi_ns.capture.sfm_photos import COPY
-from bitymi_ns.capture.types import Photograph, fail, parsing, say
+from bitymi_ns.capture.types import CaptureError, Photograph, fail, parsing, say
 from bitymi_ns.trust import listed
 
 LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"
@@ -22,14 +22,12 @@ USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "co
 """Usual folders of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
 """Lossy formats by Pillow's names: black may come back as almost black."""
-DYNAMIC_MASK = "dynamic_mask_"
-"""Prefix of instant-ngp's masks beside photographs; black counts in them."""
 MIDDLE = 127  # threshold of lossy masks, of 255
 
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks: `stated`, else the first `masks` beside the folder `photographs`, in it, or in `data`.
-    It need not exist if that of reduced masks does (`masks_2` for a `downscale` of 2).
+    """Find the folder of masks: `stated`, else the first `masks` or `mask` beside the folder `photographs`, in it, or
+    in `data`; else that of reduced masks (`masks_2` for a `downscale` of 2).
 
     If `data` is the folder of photographs, or in it, a `masks` beside it may belong to something else. It is used if
     the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`.
@@ -37,42 +35,57 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
     Raises:
         CaptureError: neither the stated one nor its reduced one exists.
     """
-    if stated is not None:
-        if not _exists(stated, downscale):
-            fail(f"the folder of masks {stated} does not exist")
-        return stated
     shown, named = Path(os.path.abspath(photographs)), Path(os.path.abspath(data))
     folders = [shown, named]
     if shown.name in USUAL_FOLDERS or not named.is_relative_to(shown):
         folders.insert(0, shown.parent)
-    return next((folder / "masks" for folder in folders if _exists(folder / "masks", downscale)), None)
+    whole = [folder / name for folder in folders for name in ("masks", "mask")] if stated is None else [stated]
+    reduced = [masks.with_name(f"{masks.name}_{downscale}") for masks in whole if downscale > 1]
+    found = next(filter(os.path.isdir, (*whole, *reduced)), None)
+    if found is None and stated is not None:
+        fail(f"the folder of masks {stated} does not exist")
+    return found
 
 
-def _exists(masks: Path, downscale: int) -> bool:
-    return masks.is_dir() or (downscale > 1 and downscaled_masks(masks, downscale).is_dir())
+def find_masks(names: Sequence[str], base: Path, masks: Path | None) -> tuple[dict[str, Path], bool]:
+    """Find the masks of photographs by their names in the folder `base`: beside them, else in the folder `masks`.
+    Return them by name, and whether they are beside."""
+    found = _named(names, base, (*MASK.names.split(), *DYNAMIC.names.split()))
+    if found or masks is None:
+        return found, bool(found)
+    return _named(names, masks, ("NAME", *MASK.names.split())), False
 
 
-def downscaled_masks(masks: Path, downscale: int) -> Path:
-    return masks.with_name(f"{masks.name}_{downscale}")
-
-
-def mask_of(masks: Path, name: str) -> Path | None:
-    """Find the mask of a photograph: its name with .png appended (COLMAP), or its stem with any image suffix
-    (nerfstudio). An upright copy has its photograph's mask."""
-    stem = str(PurePosixPath(name).with_suffix(""))
-    endings = (".png", *PHOTOGRAPHS)
-    candidates = [f"{name}.png", *(stem + ending for ending in endings), f"{name}.PNG"]
-    candidates += [stem + ending.upper() for ending in endings]
-    found = next((masks / c for c in candidates if os.path.isfile(masks / c)), None)
-    is_copy = found is None and name.endswith(COPY) and stem.lower().endswith(PHOTOGRAPHS)
-    return mask_of(masks, stem) if is_copy else found
+def _named(names: Sequence[str], folder: Path, forms: Sequence[str]) -> dict[str, Path]:
+    """Find files in a folder whose names are of these forms, NAME a photograph's with its ending (COLMAP) or without
+    (nerfstudio), or its number alone (IDR). An upright copy has its photograph's mask."""
+    there: dict[PurePath, dict[str, Path]] = {}
+    for parent in {PurePath(name).parent for name in names}:
+        files = sorted(filter(is_picture, (folder / parent).glob("*")), key=lambda file: file.suffix.lower() != ".png")
+        stems = [file.stem.lower() for file in files]
+        exact = dict(zip(reversed(stems), reversed(files), strict=True))
+        there[parent] = {f"{int(stem)}": file for stem, file in exact.items() if stem.isdecimal()} | exact
+    found = {}
+    for path in map(PurePath, names):
+        bases = [path.name.lower(), path.stem.lower()]
+        if bases[0].endswith(COPY) and bases[1].endswith(PHOTOGRAPHS):
+            bases.append(PurePath(bases[1]).stem)
+        bases += [f"{int(path.stem)}"] if path.stem.isdecimal() else []
+        files = (there[path.parent].get(form.replace("NAME", each)) for each in bases for form in forms)
+        if mask := next(filter(None, files), None):
+            found[str(path)] = mask
+    return found
 
 
 def read_mask(path: Path) -> Image.Image:
     """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. instant-ngp's are inverted. Raises
     Pillow's errors."""
     with open_picture(path) as image:
-        return Image.fromarray(mask_pixels(image) ^ path.name.startswith(DYNAMIC_MASK))
+        return Image.fromarray(mask_pixels(image) ^ _is_dynamic(path))
+
+
+def _is_dynamic(path: Path) -> bool:
+    return path.name.lower().startswith(DYNAMIC.names.removesuffix("NAME"))
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
@@ -100,42 +113,45 @@ def checked_mask(path: Path) -> Image.Image:
         return read_mask(path)
 
 
-def masks_named(masks: Path, names: Sequence[str], needed: bool = True) -> list[Path] | None:
-    """Find masks of photographs by their names in a folder; None if it has none and they are not `needed`. Raises
-    CaptureError: a mask is missing otherwise."""
-    found = {name: mask_of(masks, name) for name in names}
-    missing = [name for name, file in found.items() if file is None]
-    if len(missing) == len(found) and not needed:
-        return None
-    if missing:
-        others = "" if len(missing) == len(found) else ", but of others"
+def with_masks(
+    photographs: Sequence[Photograph],
+    capture: Path,
+    base: Path | None = None,
+    stated: Path | None = None,
+    downscale: int = 1,
+    images: Path | None = None,
+) -> list[Photograph]:
+    """Add masks to photographs, see `find_masks`, and report it. Masks beside photographs may be some.
+
+    Args:
+        base: folder of the photographs, whose paths in it name the masks; None = their common folder.
+        stated: folder of masks, relative to the capture; None = see `mask_folder`.
+        images: folder of a model's files, which have the names of those in `base`; None = no model, `base`.
+
+    Raises:
+        CaptureError: the folder has masks of some photographs only, or of none and is stated or that of a model.
+    """
+    files = [each.file for each in photographs]
+    base = base or Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))
+    names = [os.path.normpath(os.path.relpath(file, images or base)) for file in files]
+    try:
+        masks = mask_folder(base, capture, None if stated is None else capture / stated, downscale)
+    except CaptureError as error:
+        fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
+    found, beside = find_masks(names, base, masks)
+    missing = [name for name in names if name not in found]
+    if masks and missing and not beside and (found or stated or images):
+        others = ", but of others" if found else ""
         fail(
             f"{masks} has no mask of {listed(missing)}{others}. Give every photograph a mask of its name with .png (a "
             f"white picture lets all pixels count); {LEAVE_OUT}."
         )
-    return [file for name in names if (file := found[name]) is not None]
-
-
-def with_masks(photographs: Sequence[Photograph], capture: Path, base: Path | None = None) -> list[Photograph]:
-    """Add masks to photographs, and report it: instant-ngp's beside them, where some may be missing, or from a folder
-    `masks` (`mask_folder`). `base`: folder of the photographs, whose paths in it name the masks; None = their
-    common folder. Raises CaptureError: the folder has masks of some photographs only."""
-    files = [each.file for each in photographs]
-    dynamic = [file.with_name(f"{DYNAMIC_MASK}{file.stem}.png") for file in files]
-    found: Sequence[Path | None] | None = [file if os.path.isfile(file) else None for file in dynamic]
-    if any(found):
-        count = sum(file is not None for file in found)
-        said = f"{count} masks {DYNAMIC_MASK}*.png beside {len(files)} photographs are used, of which black counts"
-    else:
-        base = base or Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))
-        masks = mask_folder(base, capture)
-        names = [os.path.relpath(file, base) for file in files]
-        found = None if masks is None else masks_named(masks, names, needed=False)
-        said = f"The masks of {masks} are used, of which black does not count"
-    if found is None:
-        return list(photographs)
-    say(f"{said}; {LEAVE_OUT}.")
-    return [replace(each, mask=mask) for each, mask in zip(photographs, found, strict=True)]
+    if found:
+        some = listed([path.name for path in found.values()], most=1)
+        where = f"{some} beside {len(files)} photographs" if beside else f"of {masks}"
+        black = "counts" if beside and all(map(_is_dynamic, found.values())) else "does not count"
+        say(f"The masks {where} are used, of which black {black}; {LEAVE_OUT}.")
+    return [replace(each, mask=found.get(name)) for each, name in zip(photographs, names, strict=True)]
 
 
 def check_masks(photographs: Sequence[Photograph]) -> None:

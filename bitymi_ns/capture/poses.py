@@ -18,8 +18,8 @@ from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.folder_contents import photo_folder, refusal, unreadable_in, videos_in
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.kinds import VIDEOS
-from bitymi_ns.capture.masks import mask_folder
-from bitymi_ns.capture.prepare import IMAGES, colmap_masks, emptied, upright_photos
+from bitymi_ns.capture.masks import find_masks, mask_folder
+from bitymi_ns.capture.prepare import IMAGES, colmap_mask, emptied, upright_photos
 from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
@@ -55,14 +55,18 @@ def find_poses(
     tell = progress or no_progress
     source, folder, names = _photographs_in(Path(source))
     check_names(folder, names)
-    masks = mask_folder(folder, source, options.masks) if options.use_masks and folder.is_dir() else None
-    if masks is not None and source.is_dir():
-        below = masks / folder.relative_to(photo_folder(source))
-        masks = below if below.is_dir() else masks
+    masks: dict[str, Path] = {}
+    if options.use_masks and names:
+        where = mask_folder(folder, source, options.masks)
+        if where is not None and (below := where / folder.relative_to(photo_folder(source))).is_dir():
+            where = below
+        masks, _ = find_masks(names, folder, where)
+        if not masks and where is not None:
+            advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out"
+            raise CaptureError(f"no mask in {where} belongs to a photograph: {advice} (--use-masks False)")
     inputs = [(name, folder / name) for name in names] or [(source.name, source)]
-    if masks is not None:
-        inputs += [(f"masks/{p.relative_to(masks)}", p) for p in sorted(masks.rglob("*")) if p.is_file()]
-    settings = {**asdict(options), "masks": masks is not None}
+    inputs += [(f"masks/{name}", path) for name, path in masks.items()]
+    settings = {**asdict(options), "masks": bool(masks)}
     del settings["use_masks"]
     with work_folder(folder, content_key(inputs, settings), warn) as work:
         finished = _finished(work, folder)
@@ -116,7 +120,13 @@ def _finished(work: Path, folder: Path) -> FoundPoses | None:
 
 
 def _find(
-    source: Path, folder: Path, names: list[str], masks: Path | None, options: SfmOptions, work: Path, tell: Progress
+    source: Path,
+    folder: Path,
+    names: list[str],
+    masks: Mapping[str, Path],
+    options: SfmOptions,
+    work: Path,
+    tell: Progress,
 ) -> FoundPoses:
     begun = time.monotonic()
     seconds: dict[str, float] = {}
@@ -186,7 +196,7 @@ def make_job(
     photos: Sequence[Photo],
     images: Path,
     used: Mapping[str, str],
-    masks: Path | None,
+    masks: Mapping[str, Path],
     options: SfmOptions,
     work: Path,
     sequence: bool,
@@ -198,11 +208,13 @@ def make_job(
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:
         (links / plain[photo.name]).symlink_to((images / used[photo.name]).resolve())
-    if masks is not None:
-        colmap_masks(photos, plain, masks, mask_files)
+    for photo in photos:
+        if photo.name in masks:
+            mask = colmap_mask(masks[photo.name], photo.name, (photo.width, photo.height))
+            mask.save(mask_files / f"{plain[photo.name]}.png")
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
     cameras = [camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)]
-    mask_folder = None if masks is None else str(mask_files.resolve())
+    mask_folder = str(mask_files.resolve()) if masks else None
     return Job(
         *(str(work.resolve()), str(links.resolve()), mask_folder, cameras, list(plain.values())),
         names={plain[photo.name]: used[photo.name] for photo in photos},

@@ -2,13 +2,13 @@
 
 import os
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from PIL import Image
 
 from bitymi_ns.capture.image_files import in_proportion
-from bitymi_ns.capture.masks import checked_mask, mask_of
+from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.sfm_photos import COPY, Photo, upright
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import complete_folder
@@ -49,18 +49,6 @@ def emptied(folder: Path) -> Path:
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder
-
-
-def colmap_masks(photos: Iterable[Photo], names: dict[str, str], masks: Path, target: Path) -> None:
-    """Write masks for COLMAP to `target`, named after `names`, the photographs' names in its database. All pixels of a
-    photograph without a mask count. Raises CaptureError: a mask cannot be read, or has another aspect ratio than its
-    photograph, or no photograph has one."""
-    found = [(photo, path) for photo in photos if (path := mask_of(masks, photo.name)) is not None]
-    if not found:
-        advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out (--use-masks False)"
-        raise CaptureError(f"no mask in {masks} belongs to a photograph: {advice}")
-    for photo, path in found:
-        colmap_mask(path, photo.name, (photo.width, photo.height)).save(target / f"{names[photo.name]}.png")
 
 
 def colmap_mask(path: Path, name: str, size: tuple[int, int]) -> Image.Image:

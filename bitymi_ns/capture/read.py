@@ -13,6 +13,7 @@ import numpy as np
 from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_points, photographs_of, warn_left_out
 from bitymi_ns.capture.find_files import check_photographs_exist, name_unused
+from bitymi_ns.capture.folder_contents import photo_folder
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.masks import check_masks, with_masks
 from bitymi_ns.capture.points import Points, cloud_beside, read_cloud, with_colors
@@ -34,7 +35,6 @@ FRAMED = ("nerfstudio", *WITH_MODEL, *SCANNED)  # whose poses are oriented, cent
 OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "colmap_path": ("colmap",),
     "images_path": ("colmap",),
-    "masks_path": ("colmap", "photographs"),
     "alpha_color": ("blender",),
     **dict.fromkeys(("scene_scale", "orientation_method", "center_method", "auto_scale_poses"), FRAMED),
     "scale_factor": (*FRAMED, "blender"),
@@ -80,8 +80,8 @@ class CaptureOptions(SplitOptions, FrameOptions):
     """Use photographs that are smaller by this factor: those in images_2, images_4, ... where that folder exists."""
     images_path: Path | None = None  # Folder of a COLMAP model's photographs, relative to --data; None = find it.
     masks_path: Path | None = None
-    """Folder of masks for a COLMAP model or photographs, relative to --data; None = `masks` beside the photographs, in
-    their folder or in that of the data."""
+    """Folder of masks, relative to --data; None = masks beside the photographs, or the folder `masks` beside theirs,
+    in it or in that of the data."""
     use_masks: bool = True  # Use the masks of the capture: those that it names, or those beside its photographs.
     colmap_path: Path | None = None  # Folder of the COLMAP model, relative to --data; None = find it.
     ply_path: Path | None = None  # PLY file of points to start from, relative to --data; None = see --points.
@@ -116,14 +116,12 @@ class CaptureOptions(SplitOptions, FrameOptions):
         """Find the COLMAP model and its photographs; photographs without poses go through structure from motion."""
         downscale, kept = self.downscale_factor or 1, self.kept()
         if found.format == "colmap":
-            source = find_source(found, self.images_path, self.masks_path, downscale, need_photos)
-        elif kept is not None:
-            source = kept_source(found, kept, self.masks_path, downscale, need_photos)
-        else:
-            if self.poses is not None:
-                warn(f"The poses that the run was trained with are no longer in {self.poses}: others can be found now.")
-            source = find_sfm_source(found, self.masks_path, downscale, self.sfm, self.use_masks)
-        return source if self.use_masks else replace(source, masks=None)
+            return find_source(found, self.images_path, downscale, need_photos)
+        if kept is not None:
+            return kept_source(found, kept, downscale, need_photos)
+        if self.poses is not None:
+            warn(f"The poses that the run was trained with are no longer in {self.poses}: others can be found now.")
+        return find_sfm_source(found, self.masks_path, downscale, self.sfm, self.use_masks)
 
 
 @dataclass
@@ -194,7 +192,8 @@ class _Reader:
 
     def _read_transforms(self, path: Path) -> Transforms:
         own_format = self.found.format == "nerfstudio"
-        return read_transforms(path, own_format, self.downscale, self.need_photos, self.options.use_masks)
+        masks = (self.options.use_masks, self.options.masks_path)
+        return read_transforms(path, own_format, self.downscale, self.need_photos, *masks)
 
     def _transforms(self) -> Capture:
         """Read a transforms.json."""
@@ -243,7 +242,12 @@ class _Reader:
         if need_photos and found.format == "colmap":
             check_photographs_exist(found.path, source.files())
         named = warn_left_out(source) if need_photos else set()
-        photographs, where = photographs_of(source, need_photos), str(source.folder)
+        photographs, where = photographs_of(source), str(source.folder)
+        if need_photos and options.use_masks and found.format != "video":
+            base = source.photographs if found.format == "colmap" else photo_folder(found.path)
+            photographs = with_masks(
+                photographs, found.folder, base, options.masks_path, source.downscale, source.image_folder
+            )
         masked = {*named, *(each.mask for each in photographs)} if found.format == "colmap" else None
         self._check(source.describe(), photographs, masked)
         if found.format == "colmap":
@@ -262,7 +266,7 @@ class _Reader:
         found = self.found
         photographs, source = scanner_photographs(found, self.need_photos), str(found.path)
         if self.need_photos and self.options.use_masks:
-            photographs = with_masks(photographs, found.folder)
+            photographs = with_masks(photographs, found.folder, None, self.options.masks_path, self.downscale)
         named = {file for each in photographs for file in (each.file, each.mask)}
         self._check(f"{source} ({found.format}, {len(photographs)} photographs with their poses)", photographs, named)
         photographs = self._as_meant(photographs, source)

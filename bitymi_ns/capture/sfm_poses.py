@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
-from bitymi_ns.capture.colmap_views import Origin, Source, find_masks, make_source
+from bitymi_ns.capture.colmap_views import Origin, Source, make_source
 from bitymi_ns.capture.folder_contents import passed_over, photo_folder, videos_in
 from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
 from bitymi_ns.capture.kinds import FILM
+from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
@@ -49,7 +50,10 @@ def find_sfm_source(
     from bitymi_ns.capture.poses import find_poses  # slow to import
     from bitymi_ns.progress import rich_progress
 
-    masks = _masks(found, masks_path) if use_masks else None
+    masks = None
+    if use_masks and found.format != "video":
+        stated = None if masks_path is None else found.folder / masks_path
+        masks = mask_folder(photo_folder(found.path), found.folder, stated)
     if found.format == "photographs":
         others = passed_over(found.path)
     else:
@@ -68,8 +72,7 @@ def find_sfm_source(
         say(by_gps)
     if poses.doubt:
         warn(poses.doubt)
-    masks = _masks(found, masks_path, downscale)
-    source = make_source(poses.model, poses.images, masks, downscale, poses.left_out)
+    source = make_source(poses.model, poses.images, downscale, poses.left_out)
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames are in the work folder
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
@@ -77,13 +80,12 @@ def find_sfm_source(
     return replace(source, report=poses.report, origin=origin)
 
 
-def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscale: int, need_photos: bool) -> Source:
+def kept_source(found: Found, kept: KeptPoses, downscale: int, need_photos: bool) -> Source:
     """Return the model that a run was trained with. Raises CaptureError: needed photographs of it are missing, or have
     changed their size."""
-    masks = _masks(found, masks_path, downscale)
     photographs = kept.origin.photographs
     images = kept.folder / IMAGES if photographs is None else found.folder / photographs
-    source = make_source(kept.folder / MODEL, images, masks, downscale, kept.left_out)
+    source = make_source(kept.folder / MODEL, images, downscale, kept.left_out)
     if need_photos:
         files = source.files()
         missing = [file.readlink() if file.is_symlink() else file for file in files if not os.path.isfile(file)]
@@ -103,11 +105,6 @@ def kept_source(found: Found, kept: KeptPoses, masks_path: Path | None, downscal
     count = len(source.model.images)
     say(f"Poses of {count} photographs of {found.path} as the run was trained with them, of {kept.folder}.")
     return replace(source, report=kept.folder, origin=kept.origin)
-
-
-def _masks(found: Found, stated: Path | None, downscale: int = 1) -> Path | None:
-    """Find the folder of masks, which upright copies share; a video has none."""
-    return None if found.format == "video" else find_masks(photo_folder(found.path), found.folder, stated, downscale)
 
 
 def has_kept_poses(folder: Path) -> bool:

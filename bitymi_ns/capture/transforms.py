@@ -72,7 +72,12 @@ class Transforms:
 
 
 def read_transforms(
-    path: Path, own_format: bool, downscale: int = 1, need_photos: bool = True, use_masks: bool = True
+    path: Path,
+    own_format: bool,
+    downscale: int = 1,
+    need_photos: bool = True,
+    use_masks: bool = True,
+    masks_path: Path | None = None,
 ) -> Transforms:
     """Read a JSON file, see `load_transforms`, and find its photographs, or copies smaller by `downscale`, its maps and
     masks, see `with_masks`. Raises CaptureError: the file cannot be used, or lacks photographs that are needed."""
@@ -113,8 +118,9 @@ def read_transforms(
         pose = np.array(frame["transform_matrix"])
         photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask, maps=beside))
     photographs.sort(key=lambda photograph: photograph.file)
-    if use_masks and need_photos and not any(masks):
-        photographs = with_masks(photographs, path.parent, path.parent if path.name in SPLITS else None)
+    if use_masks and need_photos and (masks_path or not any(masks)):
+        base = path.parent if path.name in SPLITS else None
+        photographs = with_masks(photographs, path.parent, base, masks_path, downscale)
     used = [*files, *(each.mask for each in photographs), *(file for each in maps for file in astuple(each))]
     if downscale > 1:
         photographs = downscaled(photographs, path.parent, downscale)

@@ -7,7 +7,8 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.capture.image_files import in_proportion
-from bitymi_ns.capture.masks import mask_folder, mask_of, mask_pixels
+from bitymi_ns.capture.kinds import DYNAMIC, MASK
+from bitymi_ns.capture.masks import find_masks, mask_folder, mask_pixels
 from bitymi_ns.capture.types import CaptureError
 
 
@@ -24,6 +25,7 @@ from bitymi_ns.capture.types import CaptureError
         ("all/bed", "all/bed", ["all/bed/masks", "all/masks"], "all/bed/masks"),
         ("all/bed", "all/bed", ["all/masks"], None),  # of another capture
         ("all/bed", "all/bed/sparse/0", ["all/masks"], None),
+        ("bed/images", "bed", ["bed/mask"], "bed/mask"),
         ("bed/images", "bed", [], None),
     ],
 )
@@ -45,7 +47,7 @@ def test_the_folder_of_masks_that_is_given_and_of_smaller_ones_alone(tmp_path: P
     with pytest.raises(CaptureError, match="the folder of masks .*/yours does not exist"):
         mask_folder(tmp_path / "images", tmp_path, tmp_path / "yours")
     assert mask_folder(tmp_path / "images", tmp_path) is None
-    assert mask_folder(tmp_path / "images", tmp_path, downscale=2) == tmp_path / "masks"
+    assert mask_folder(tmp_path / "images", tmp_path, downscale=2) == tmp_path / "masks_2"
     assert in_proportion((144, 108), (288, 216)) and in_proportion((67, 50), (4000, 3000))
     assert not in_proportion((216, 288), (288, 216))
 
@@ -55,7 +57,8 @@ def test_the_folder_of_masks_that_is_given_and_of_smaller_ones_alone(tmp_path: P
     [
         ("a.jpg", ["a.png", "a.jpg.png", "a.PNG", "a.jpg.PNG"]),
         ("a.png", ["a.jpg"]),
-        ("b/a.jpg", ["b/a.png"]),
+        ("b/a.jpg", ["b/a.png", "b/A.png", "b/a_mask.png", "b/a.jpg.mask.png"]),
+        ("000012.png", ["012.png", "12.png"]),  # IDR
         ("a.heic.jpg", ["a.png", "a.heic.png", "a.heic.jpg.png"]),  # an upright copy
     ],
 )
@@ -64,10 +67,20 @@ def test_a_mask_is_found_by_the_name_of_its_photograph(tmp_path: Path, name: str
         path = tmp_path / file
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(b"")
-        assert mask_of(tmp_path, name) == path
+        assert find_masks([name], tmp_path / "images", tmp_path) == ({name: path}, False)
         path.unlink()
     (tmp_path / "a.png").write_bytes(b"")
-    assert mask_of(tmp_path, "c/a.jpg") is None and mask_of(tmp_path, "a.b.jpg") is None
+    assert find_masks(["c/a.jpg", "a.b.jpg"], tmp_path / "images", tmp_path) == ({}, False)
+
+
+@pytest.mark.parametrize("form", [*MASK.names.split(), *DYNAMIC.names.split()])
+@pytest.mark.parametrize("ending", ["", ".jpg"])
+def test_masks_beside_photographs_are_used_before_a_folder(tmp_path: Path, form: str, ending: str) -> None:
+    for name in ("photos/cam1/a.jpg", "masks/cam1/a.png", f"photos/cam1/{form.replace('NAME', f'a{ending}')}.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    found = find_masks(["cam1/a.jpg", "cam1/b.jpg"], tmp_path / "photos", tmp_path / "masks")
+    assert found == ({"cam1/a.jpg": tmp_path / name}, True)
 
 
 def blob() -> np.ndarray:

@@ -301,7 +301,7 @@ def test_every_setting_is_part_of_the_key(copied: Copy, monkeypatch: pytest.Monk
 
 def test_every_setting_reaches_the_job(tmp_path: Path) -> None:
     photos = [photo("a.jpg", focal_length=350.0)]
-    job = make_job(photos, tmp_path, {"a.jpg": "a.jpg"}, None, SfmOptions(**OTHER), tmp_path, sequence=False)
+    job = make_job(photos, tmp_path, {"a.jpg": "a.jpg"}, {}, SfmOptions(**OTHER), tmp_path, sequence=False)
     assert (job.matching, job.mapper, job.max_image_size, job.max_features) == ("sequential", "global", 800, 1234)
     camera = job.cameras[0].camera
     assert camera.model == "OPENCV" and camera.params[:2] == (321.0, 321.0) and not job.opencv_if_better

@@ -254,6 +254,16 @@ def printable(text: str) -> str:
     return _CONTROLS.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
 
 
+def told_apart(paths: Sequence[Path]) -> list[str]:
+    """Name files, with as many of the folders above them as tell all of them apart."""
+    count = len(set(paths))
+    for depth in range(1, max((len(path.parts) for path in paths), default=0) + 1):
+        names = ["/".join(path.parts[-depth:]) for path in paths]
+        if len(set(names)) == count:
+            return names
+    return [str(path) for path in paths]
+
+
 def listed(names: Sequence[object], most: int = 3) -> str:
     """Join the first few names, truncated to LONGEST characters, and the number of further ones."""
     shown = ", ".join(str(name)[:LONGEST] for name in names[:most])

@@ -22,7 +22,17 @@ from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.process import BenchError, run_measured
 from bitymi_ns.plugin.run.callbacks import TrainingCurve
 from bitymi_ns.plugin.run.run_folder import keep_poses_report
-from bitymi_ns.trust import Refused, check_replaceable, inside, is_own, json_of, no_links, own_folder, printable
+from bitymi_ns.trust import (
+    Refused,
+    check_replaceable,
+    inside,
+    is_own,
+    json_of,
+    no_links,
+    own_folder,
+    printable,
+    told_apart,
+)
 
 
 @pytest.fixture
@@ -324,3 +334,10 @@ def test_a_key_is_not_of_how_a_path_is_written(tmp_path: Path, monkeypatch: pyte
     (tmp_path / "a").write_text("x")
     monkeypatch.chdir(tmp_path)
     assert content_key([("a", Path("a"))], {}) == content_key([("a", tmp_path / ".." / tmp_path.name / "a")], {})
+
+
+def test_names_have_as_many_folders_as_tell_them_apart() -> None:
+    alike = [Path(f"/a/cam{i}/images/{name}.jpg") for i in range(2) for name in "ab"]
+    assert told_apart(alike[:2]) == ["a.jpg", "b.jpg"]
+    assert told_apart(alike)[::2] == ["cam0/images/a.jpg", "cam1/images/a.jpg"]
+    assert told_apart([alike[0], alike[0]]) == ["a.jpg", "a.jpg"] and told_apart([]) == []

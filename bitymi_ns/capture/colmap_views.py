@@ -12,7 +12,8 @@ import numpy as np
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
 from bitymi_ns.capture.find_files import FileFinder, renamed_message
-from bitymi_ns.capture.folder_contents import photographs_below, photographs_in, result_in
+from bitymi_ns.capture.folder_contents import images_of, photographs_below, photographs_in, result_in
+from bitymi_ns.capture.image_files import image_size, in_proportion
 from bitymi_ns.capture.masks import USUAL_FOLDERS
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.recognise import Found
@@ -76,8 +77,16 @@ class Source:
 
 def find_source(found: Found, images: Path | None, downscale: int, need_photos: bool) -> Source:
     """Find the photographs of a COLMAP model: at a stated path in the capture, else by searching it."""
-    names = [image.name for image in read_model(found.path).images]
+    model = read_model(found.path)
+    names = [image.name for image in model.images]
     photographs = _find_folder(names, found.path, found.folder, images, downscale, need_photos)
+    factor, camera = photographs.name.rpartition("_")[2], model.cameras[model.images[0].camera_id]
+    size = image_size(photographs / names[0]) if need_photos and factor.isdecimal() else None
+    if size is not None and size != camera.size and in_proportion(size, camera.size) and factor != str(downscale):
+        fail(
+            f"of the photographs of {found.path}, of {camera.width} x {camera.height} pixels, only copies of "
+            f"{size[0]} x {size[1]} are there, in {photographs}: `bitymi-data --downscale-factor {factor}` uses them."
+        )
     return make_source(found.path, photographs, downscale, {})
 
 
@@ -108,7 +117,7 @@ def _find_folder(
         bases += [path for path in folder.parents if path.is_relative_to(capture) and path != capture]
     if folder == capture:
         bases += folder.parents[:3]
-    folders = [base / name for base in bases for name in USUAL_FOLDERS]
+    folders = [*images_of(folder), *(base / name for base in bases for name in USUAL_FOLDERS)]
     folders += [path for path in sorted(capture.iterdir()) if path.is_dir() and not result_in(path)]
     folders += bases
 
@@ -133,7 +142,7 @@ def _find_folder(
     if counts[other] > exact_count(best):
         return other
     if exact_count(best) == 0:
-        near = [hint for each in searched if each.is_dir() and (hint := FileFinder(each).nearest(names[0]))]
+        near = [hint for each in searched if each.is_dir() and (hint := FileFinder(each).nearest(names[0], names))]
         hint = f" ({near[0]})" if near else ""
         fail(
             f"the COLMAP model {folder} is of {listed(names)}, which are in none of the folders of {capture}{hint}. "

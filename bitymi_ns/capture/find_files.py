@@ -14,7 +14,7 @@ from typing import Any
 from bitymi_ns.capture.folder_contents import passed_over, result_in
 from bitymi_ns.capture.kinds import PHOTOGRAPHS
 from bitymi_ns.capture.types import MAP_FILES, MapFiles, Photograph, fail, say, warn
-from bitymi_ns.trust import leads_inside, listed
+from bitymi_ns.trust import leads_inside, listed, told_apart
 
 Parts = tuple[str, ...]  # folders and file of a name, in one case and one Unicode form
 _DRIVE = re.compile(r"^[A-Za-z]:")
@@ -79,10 +79,10 @@ class FileFinder:
         files = self._stems.get(without_extension(folded(name)), [])
         return [path.relative_to(self.folder).as_posix() for path in files] if len(files) > 1 else []
 
-    def nearest(self, name: str) -> str:
-        """Describe a file of a similar name, as "but there is ..."; empty = none."""
-        wanted = folded(name)[-1:]
-        last = {parts[-1]: files[0] for parts, files in self._whole.items()}
+    def nearest(self, name: str, taken: Iterable[str] = ()) -> str:
+        """Describe a file of a similar name that is not of the names `taken`, as "but there is ..."; empty = none."""
+        wanted, others = folded(name)[-1:], {folded(each)[-1:] for each in taken}
+        last = {parts[-1]: files[0] for parts, files in self._whole.items() if parts[-1:] not in others}
         near = difflib.get_close_matches(wanted[0] if wanted else "", last, n=1, cutoff=0.8)
         if not near:
             return ""
@@ -125,11 +125,21 @@ def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
     missing = [file for file in names if not os.path.isfile(file)]
     if not missing:
         return
-    some = "\n  ".join(f"{file}{_hint(source.parent, file)}" for file in missing[:3])
+    some = "\n  ".join(f"{file}{_hint(source.parent, file, names)}" for file in missing[:3])
     fail(
         f"{len(missing)} of {len(names)} photographs of {source} are missing:\n  {some}\n"
-        "Copy them there, correct the names or remove the frames."
+        f"Copy them there, correct the names or remove the frames.{smaller_copies(missing)}"
     )
+
+
+def smaller_copies(files: Iterable[Path]) -> str:
+    """Say how to use copies of missing photographs that are there in a folder such as `images_2`; empty = none."""
+    for file in files:
+        for factor in (2, 4, 8, 16):
+            folder = file.parent.with_name(f"{file.parent.name}_{factor}")
+            if os.path.isfile(folder / file.name):
+                return f" Or use their copies in {folder}: `bitymi-data --downscale-factor {factor}`."
+    return ""
 
 
 def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None = None) -> None:
@@ -141,12 +151,14 @@ def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None
         say(f"Not taken for photographs in {folder}: {listed(others, most=12)}.")
 
 
-def _hint(folder: Path, file: Path) -> str:
+def _hint(folder: Path, file: Path, named: Sequence[Path]) -> str:
     if os.path.islink(file):
         return " (a link to nothing)"
     if os.path.exists(file):
         return " (not a file)"
-    near = FileFinder(file.parent if os.path.isdir(file.parent) else folder).nearest(file.name)
+    near = FileFinder(file.parent if os.path.isdir(file.parent) else folder).nearest(
+        file.name, [each.name for each in named]
+    )
     return f" ({near})" if near else ""
 
 
@@ -251,7 +263,7 @@ def find_named(names: Sequence[Path], wanted: Sequence[str], source: str, any_fo
         found += fitting
         unknown += [] if fitting else [name]
     if unknown:
-        which = f"{listed(unknown)}. Its photographs are {listed([name.name for name in names])}."
+        which = f"{listed(unknown)}. Its photographs are {listed(told_apart(names))}."
         fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {which}")
     return found
 

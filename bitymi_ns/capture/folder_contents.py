@@ -16,6 +16,7 @@ from bitymi_ns.capture.kinds import (
     BUNDLE,
     FILM,
     FOLDERS,
+    IMAGES_OF,
     PHOTOGRAPHS,
     PICTURES,
     POSES,
@@ -216,6 +217,13 @@ def result_in(folder: Path) -> Kind | None:
         return EVALUATED
     rendered = pictures and all(holds(folder / pictures[i], RENDERED, COMMENT) for i in (0, -1))
     return RENDERS if rendered else None
+
+
+def images_of(model: Path) -> list[Path]:
+    """List the folders of pictures that belong to a COLMAP model by the table, the likeliest first."""
+    path, found = os.path.abspath(model), ((_pattern(row.names), row.what) for row in IMAGES_OF)
+    matches = [(pattern.match(path), what) for pattern, what in found]
+    return [Path(what.replace("NAME", next(filter(None, match.groups())))) for match, what in matches if match]
 
 
 def refusal(folder: Path) -> str:

@@ -91,3 +91,8 @@ POSES = (
     Kind("geo.txt", "positions of ODM", use="write them to the photographs' EXIF, as with exiftool", mark=b"EPSG"),
 )  # fmt: skip
 """Files of poses that are not read, by program; IMAGES and FOLDER are those of the photographs and of the capture."""
+IMAGES_OF = (
+    Kind("NAME/distorted/sparse NAME/distorted/sparse/*", "NAME/input"),
+    Kind("NAME/sparse NAME/sparse/[0-9]*", "NAME/images"),
+)
+"""Folders of COLMAP models, and of the pictures that belong to them."""

@@ -24,7 +24,7 @@ from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.sfm_photos import Photo, blurred, check_names, duplicates, find_photos, read_photos
+from bitymi_ns.capture.sfm_photos import ALIKE, Photo, blurred, check_names, duplicates, find_photos, read_photos
 from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, FoundPoses, SfmOptions, is_full_sphere
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file
@@ -32,7 +32,7 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.safe_reading import read_json
 
 GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
-TELLING = 0.25  # least share of 360-degree pictures among photographs of a size for all of them to count as such
+TELLING = 0.25  # least share of what looks like 360-degree pictures among photographs for all of them to be some
 LEAST = 3  # fewest photographs
 SPARSE = Path("sparse/0")  # the model's path in a result
 
@@ -73,7 +73,7 @@ def find_poses(
         if finished is not None:
             return finished
         with write_errors_as(work, CaptureError):
-            found = _find(source, folder, names, masks, options, work, tell)
+            found = _find(source, folder, names, masks, options, warn, work, tell)
             replace_stale(work, folder, content_key(inputs, "contents"))
             return found
 
@@ -125,6 +125,7 @@ def _find(
     names: list[str],
     masks: Mapping[str, Path],
     options: SfmOptions,
+    warn: Tell,
     work: Path,
     tell: Progress,
 ) -> FoundPoses:
@@ -137,7 +138,7 @@ def _find(
         given, seconds["taking frames"] = len(names), time.monotonic() - begun
     read = time.monotonic()
     photos, left_out = read_photos(folder, names, tell)
-    photos = _with_panoramas(source, photos, left_out, options.camera_model == SPHERICAL_MODEL)
+    photos = _with_panoramas(folder, photos, left_out, options.camera_model, warn)
     twins = duplicates(photos)
     left_out |= {name: f"the same as {twin}" for name, twin in twins.items()}
     photos = [photo for photo in photos if photo.name not in twins]
@@ -168,14 +169,28 @@ def _find(
     return _write(work, images, {**values, **result}, photos, job)
 
 
-def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str], every: bool) -> list[Photo]:
-    """Mark 360-degree pictures: detected ones, others of their size, or `every` one. Leave out panoramas of another
-    shape, which do not show all directions; fail if most are."""
-    groups: dict[tuple[int, int], list[Photo]] = defaultdict(list)
+def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str], model: str, warn: Tell) -> list[Photo]:
+    """Decide of the photographs of a size in a folder together if they are 360-degree pictures: by the camera `model`
+    if it is stated, or as a quarter of them or most of their edges tell. Leave out panoramas of another shape, which do
+    not show all directions; fail if most are."""
+    groups: dict[tuple[str, int, int], list[Photo]] = defaultdict(list)
     for photo in photos:
-        groups[photo.width, photo.height].append(photo)
-    panoramic = {size for size, of_size in groups.items() if sum(p.panorama for p in of_size) >= TELLING * len(of_size)}
-    photos = [replace(p, panorama=every or p.panorama or (p.width, p.height) in panoramic) for p in photos]
+        groups[os.path.dirname(photo.name), photo.width, photo.height].append(photo)
+    decided = {}
+    for key, alike in groups.items():
+        told = [photo for photo in alike if photo.panorama]
+        closed = len(alike) >= LEAST and statistics.median(photo.seam for photo in alike) > ALIKE
+        decided[key] = model == SPHERICAL_MODEL or (
+            model == "auto" and (closed or len(told) >= TELLING * len(alike) > 0.0)
+        )
+        if model == "auto" and len(told) not in (0, len(alike)):
+            size, other = f"{key[1]} x {key[2]}", "SIMPLE_RADIAL" if decided[key] else SPHERICAL_MODEL
+            what = "360-degree pictures" if decided[key] else "photographs"
+            warn(
+                f"{len(told)} of {len(alike)} photographs of {size} pixels in {source / key[0]} look like 360-degree "
+                f"pictures: all of them are taken for {what}; camera model {other} takes them for the other."
+            )
+    photos = [replace(p, panorama=decided[os.path.dirname(p.name), p.width, p.height]) for p in photos]
     partial = [photo.name for photo in photos if photo.panorama and not is_full_sphere(photo.width, photo.height)]
     if len(partial) > len(photos) / 2:
         raise CaptureError(

@@ -23,7 +23,7 @@ from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.sfm.consistency import rays_meet
 from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, CaptureError, ColmapCamera, Photograph, fail, warn
 from bitymi_ns.ranges import spread
-from bitymi_ns.trust import listed
+from bitymi_ns.trust import listed, told_apart
 
 Array = npt.NDArray[np.float64]
 Features = tuple[Array, npt.NDArray[np.float32]]
@@ -251,7 +251,8 @@ def decide(photographs: Sequence[Photograph], poses: Array, written: Reading) ->
     sums = np.zeros((2, len(photographs)))
     for pair, *both in zip(pairs, counts[written], own, strict=True):
         sums[:, [pair.first, pair.second]] += np.array(both)[:, None]
-    worst = [photographs[i].file.name for i in np.argsort(sums[0] / np.maximum(sums[1], 1e-9)) if sums[1, i]]
+    names = told_apart([each.file for each in photographs])
+    worst = [names[i] for i in np.argsort(sums[0] / np.maximum(sums[1], 1e-9)) if sums[1, i]]
     return Decision(None, share, as_written, most, tuple(worst[:3]))
 
 

@@ -55,6 +55,7 @@ class Photo:
     thumb: np.ndarray  # [h,w] float32 grey levels, longer side THUMB
     sharpness: float  # see `sharpness`
     panorama: bool = False  # a 360-degree picture
+    seam: float = 0.0  # see `seam`
 
 
 def find_photos(folder: Path) -> list[str]:
@@ -125,7 +126,7 @@ def read_photo(folder: Path, name: str) -> Photo:
     thumb = np.asarray(_reduced(grey, THUMB), np.float32)
     detail = np.asarray(_reduced(grey, SHARPNESS_SIZE), np.float32)
     panorama = has_panorama_metadata(path) or looks_panoramic(thumb)
-    return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail), panorama)
+    return Photo(name, path, width, height, exif, plain, thumb, sharpness(detail), panorama, seam(thumb))
 
 
 def has_panorama_metadata(path: Path) -> bool:
@@ -140,17 +141,19 @@ def has_panorama_metadata(path: Path) -> bool:
 def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
     """Test if left and right edge continue each other, and first and last row are constant, in grey levels [h, w] to
     255 of a picture reduced to some hundreds of pixels."""
+    return seam(grey) > ALIKE and bool(max(grey[0].std(), grey[-1].std()) <= POLE * grey.std())
+
+
+def seam(grey: npt.NDArray[np.float32]) -> float:
+    """Correlate the details of the left and the right edge; 0 where these are bare, or for other shapes than that of
+    360-degree pictures."""
     height, width = grey.shape
     if height < 32 or not is_full_sphere(width, height):
-        return False
-    if max(grey[0].std(), grey[-1].std()) > POLE * grey.std():
-        return False
+        return 0.0
     kernel = np.full(SMOOTH, 1.0 / SMOOTH)
     columns = grey[:, [0, -1]].T.astype(np.float64)
     detail = [column[SMOOTH // 2 : -(SMOOTH // 2)] - np.convolve(column, kernel, "valid") for column in columns]
-    if min(each.std() for each in detail) < DETAIL:
-        return False
-    return bool(np.corrcoef(detail)[0, 1] > ALIKE)
+    return float(np.corrcoef(detail)[0, 1]) if min(each.std() for each in detail) >= DETAIL else 0.0
 
 
 def is_plain(image: Image.Image, path: Path) -> bool:

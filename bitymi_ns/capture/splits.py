@@ -13,7 +13,7 @@ import numpy as np
 from bitymi_ns.capture.find_files import find_named
 from bitymi_ns.capture.types import Photograph, fail, parsing, warn
 from bitymi_ns.safe_reading import read_text
-from bitymi_ns.trust import listed
+from bitymi_ns.trust import listed, told_apart
 
 Mode = Literal["fraction", "filename", "interval", "all"]
 NSVF = {"0": "train", "1": "val", "2": "test"}  # splits by the first number of NSVF's names
@@ -52,7 +52,8 @@ class Split(NamedTuple):
             return f"All {len(self.train)} photographs are trained on: none is held out for evaluation."
         if self.rule == "all":
             return f"All {len(names)} photographs are trained on, and evaluated on, too (--eval-mode all)."
-        shown = listed([names[i].name for i in self.held_out], most=2)
+        short = told_apart(names)
+        shown = listed([short[i] for i in self.held_out], most=2)
         return f"Held out for evaluation: {len(self.held_out)} of {len(names)} photographs, {self.rule} ({shown})."
 
 
@@ -98,10 +99,10 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
         return Split(train, sorted(set(indices) - set(train)), rule)
     train = [i for i in indices if "train" in names[i].name]
     held_out = [i for i in indices if "train" not in names[i].name and "eval" in names[i].name]
-    neither = [names[i].name for i in sorted(set(indices) - {*train, *held_out})]
-    if neither:
+    if neither := sorted(set(indices) - {*train, *held_out}):
+        which, short = "has neither train nor eval in its name", told_apart(names)
         advice = "Use `--eval-names`, or another mode."
-        fail(f"--eval-mode filename: {listed(neither)} has neither train nor eval in its name. {advice}")
+        fail(f"--eval-mode filename: {listed([short[i] for i in neither])} {which}. {advice}")
     return Split(train, held_out, "those with eval in their names")
 
 

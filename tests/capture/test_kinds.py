@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.folder_contents import passed_over, poses_in
-from bitymi_ns.capture.kinds import FOLDERS, PICTURES, POSES, RENDERS, RESULTS, UNREAD, Kind
+from bitymi_ns.capture.folder_contents import images_of, passed_over, poses_in
+from bitymi_ns.capture.kinds import FOLDERS, IMAGES_OF, PICTURES, POSES, RENDERS, RESULTS, UNREAD, Kind
 from bitymi_ns.capture.sfm_photos import find_photos
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/capture.md"
@@ -17,6 +17,7 @@ TABLES = {
     "what is in a folder of results": RESULTS,
     "formats that are not read": UNREAD,
     "poses that are not read": POSES,
+    "models, and their pictures": IMAGES_OF,
 }
 
 
@@ -96,3 +97,8 @@ def test_poses_of_other_programs(tmp_path: Path, row: Kind, name: str, whose: st
     (found,) = poses_in(tmp_path)
     assert found.startswith(f"{below}{name.upper()} ({row.what}")
     assert not {"FILE", "IMAGES", "FOLDER"} & {*found.replace("'", " ").split()}
+
+
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(IMAGES_OF)))
+def test_pictures_of_a_model(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
+    assert images_of(tmp_path / name)[0] == tmp_path / row.what.replace("NAME", "img")

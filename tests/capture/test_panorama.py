@@ -9,9 +9,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
+from bitymi_ns.capture.exif import Exif
 from bitymi_ns.capture.known_poses import triangulate
-from bitymi_ns.capture.poses import find_poses
-from bitymi_ns.capture.sfm_photos import has_panorama_metadata, looks_panoramic
+from bitymi_ns.capture.poses import _with_panoramas, find_poses
+from bitymi_ns.capture.sfm_photos import Photo, has_panorama_metadata, looks_panoramic
 from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, Photograph, SfmOptions
 from bitymi_ns.sample.room import Room
 
@@ -70,6 +71,24 @@ def test_other_pictures_of_that_shape() -> None:
     sea = np.where(y < 60, 200.0 - y, 90.0) + np.random.default_rng(0).normal(0, 12, (128, 256)) * (y > 60)
     for pixels in (product, sea, np.zeros((128, 256)), np.random.default_rng(1).uniform(0, 255, (128, 256))):
         assert not looks_panoramic(pixels.astype(np.float32))
+
+
+@pytest.mark.parametrize(("model", "told", "seams", "answer"), [
+    ("auto", 2, 0.7, True), ("auto", 2, 0.3, False), ("auto", 3, 0.3, True), ("auto", 0, 0.3, False),
+    ("SIMPLE_RADIAL", 12, 0.9, False), ("EQUIRECTANGULAR", 0, 0.0, True),
+])  # fmt: skip
+def test_pictures_of_a_size_and_folder_have_one_answer(model: str, told: int, seams: float, answer: bool) -> None:
+    """A pole may have detail, and a seam may close by chance."""
+    some = dict(exif=Exif(), plain=True, thumb=np.zeros((1, 1)), sharpness=1.0)
+    photos = [Photo(f"a/{i}.jpg", Path(), 1024, 512, **some, panorama=i < told, seam=seams) for i in range(12)]
+    photos.append(Photo("b/0.jpg", Path(), 1024, 512, **some))
+    lines: list[str] = []
+    decided = _with_panoramas(Path("walk"), photos, {}, model, lines.append)
+    assert [photo.panorama for photo in decided[:12]] == [answer] * 12
+    assert decided[12].panorama is (model == "EQUIRECTANGULAR")
+    assert [line.split(" look")[0] for line in lines] == (
+        [f"{told} of 12 photographs of 1024 x 512 pixels in walk/a"] if model == "auto" and told else []
+    )
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

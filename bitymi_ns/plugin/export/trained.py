@@ -27,6 +27,7 @@ from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.scene.baked import BakedScene, as_bytes
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import fitted_psnr, psnr
+from bitymi_ns.trust import told_apart
 
 _PSNR_SLACK = 0.1  # dB
 MOST_PIXELS = 1600  # longer side of a photograph in a bundle
@@ -78,16 +79,17 @@ def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool, e
     """Make cameras.json, with colour corrections by the state of the run's `Exposure` (None: none), and, if asked for,
     the held-out photographs as JPEG of at most `MOST_PIXELS` along a side: contents by name of the file."""
     files: dict[str, bytes] = {}
-    names = [path.name for path in datamanager.train_dataset.image_filenames]
+    files = [*datamanager.train_dataset.image_filenames, *datamanager.eval_dataset.image_filenames]
+    names = told_apart(files)
     trained, held_out = datamanager.corrections(exposure)
-    given = zip(names, train, trained, strict=True)
+    given = zip(names[: len(train)], train, trained, strict=True)
     rows = [CapturedCamera.of(name, camera, False, correction=of_camera) for name, camera, of_camera in given]
-    for i, path in enumerate(datamanager.eval_dataset.image_filenames):
+    for i, name in enumerate(names[len(train) :]):
         view = datamanager.eval_views[i]
         photograph = f"photograph-{i + 1:04d}.jpg" if photographs else None
         if photograph is not None:
             files[photograph] = _encoded(view.target(torch.zeros(3), "cpu"), "JPEG", MOST_PIXELS, quality=88)
-        rows.append(CapturedCamera.of(path.name, view.camera, True, photograph, held_out[i]))
+        rows.append(CapturedCamera.of(name, view.camera, True, photograph, held_out[i]))
     return {CAMERAS: cameras_data(rows), **files}
 
 

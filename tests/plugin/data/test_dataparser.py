@@ -180,7 +180,7 @@ def test_two_things_in_one_folder(capture: Path, capsys: pytest.CaptureFixture[s
     assert "Not read: transforms.json (`bitymi-data --format nerfstudio`)" in text
 
 
-@pytest.mark.parametrize("name", ["images_path", "masks_path", "alpha_color"])
+@pytest.mark.parametrize("name", ["images_path", "alpha_color"])
 def test_options_that_are_for_something_else_are_refused(capture: Path, name: str) -> None:
     assert OPTION_FORMATS.keys() <= BitymiDataParserConfig.__dataclass_fields__.keys()
     with expect(f"--{name.replace('_', '-')} is not for"):

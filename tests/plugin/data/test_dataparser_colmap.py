@@ -135,7 +135,27 @@ def test_whole_masks_serve_reduced_photographs(project: Path) -> None:
         load_any(project, masks_path=Path("mine"))
 
 
+@pytest.mark.parametrize(("place", "own"), [("dense/0/sparse", "dense/0/images"), ("distorted/sparse/0", "input")])
+def test_pictures_that_belong_to_a_model(project: Path, place: str, own: str) -> None:
+    """Others of the same names, of another lens, lie in `images`."""
+    shutil.copytree(project / "sparse/0", project / place)
+    shutil.copytree(project / "images", project / own)
+    manager = load_any(project, colmap_path=Path(place))
+    assert {path.parent for path in manager.train_dataset.image_filenames} == {project / own}
+    assert {path.parent for path in load_any(project).train_dataset.image_filenames} == {project / "images"}
+
+
 # what is wrong
+
+
+def test_smaller_copies_alone(project: Path) -> None:
+    reduce_photographs(project, 2, (24, 18))
+    shutil.rmtree(project / "images")
+    with expect(
+        "of 48 x 36 pixels, only copies of 24 x 18 are there, in .*images_2: `bitymi-data --downscale-factor 2`"
+    ):
+        load_any(project)
+    assert load_any(project, downscale_factor=2).cached_train[0]["image"].shape[:2] == (18, 24)
 
 
 def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytest.CaptureFixture[str]) -> None:

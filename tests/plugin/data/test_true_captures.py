@@ -224,6 +224,14 @@ def test_a_name_that_is_nearly_there(capture: Path, form: Callable[[Path], Path]
         load_any(place)
 
 
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
+def test_the_file_of_another_frame_is_not_proposed(capture: Path, form: Callable[[Path], Path]) -> None:
+    place = form(capture)
+    images_of(capture)[3].unlink()
+    with expect(r"(?s)1 of 12 photographs .*frame_00004.png\s+Copy"):
+        load_any(place)
+
+
 def test_names_of_a_model_that_lead_elsewhere_are_those_of_photographs_in_the_capture(
     project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -41,7 +41,6 @@ class Source:
     folder: Path  # of the model
     photographs: Path  # folder to which names in the model are relative
     downscale: int = 1  # factor by which photographs are reduced
-    copies: Path | None = None  # folder of reduced copies; None = reduce photographs on reading
     left_out: Mapping[str, str] = field(default_factory=dict)  # photographs that the model lacks, and known reasons
     report: Path | None = None  # folder of the report on structure from motion; None = none
     origin: Origin | None = None  # None = the capture came with the model
@@ -53,8 +52,9 @@ class Source:
 
     @property
     def image_folder(self) -> Path:
-        """Folder of the files that are read."""
-        return self.copies or self.photographs
+        """Folder of the files that are read: reduced copies such as `images_2` if there are any."""
+        smaller = self.photographs.with_name(f"{self.photographs.name}_{self.downscale}")
+        return smaller if self.downscale > 1 and smaller.is_dir() else self.photographs
 
     def files(self) -> list[Path]:
         """Find the files of the model's images; for a missing one, return the path that the model names."""
@@ -70,7 +70,7 @@ class Source:
         cameras = " and ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         text = f"COLMAP model {self.folder} ({len(model.images)} photographs, {cameras} camera"
         text += f"{'s' if len(used) > 1 else ''}, {len(model.xyz):,} points), photographs {self.image_folder}"
-        if self.downscale > 1 and self.copies is None:
+        if self.downscale > 1 and self.image_folder == self.photographs:
             text += f", reduced {self.downscale} times as they are read"
         return text
 
@@ -87,26 +87,15 @@ def find_source(found: Found, images: Path | None, downscale: int, need_photos: 
             f"of the photographs of {found.path}, of {camera.width} x {camera.height} pixels, only copies of "
             f"{size[0]} x {size[1]} are there, in {photographs}: `bitymi-data --downscale-factor {factor}` uses them."
         )
-    return make_source(found.path, photographs, downscale, {})
-
-
-def make_source(folder: Path, photographs: Path, downscale: int, left_out: Mapping[str, str]) -> Source:
-    """Make a source of known folders, with downscaled copies (`images_2`) if there are any."""
-    smaller = photographs.with_name(f"{photographs.name}_{downscale}")
-    return Source(
-        folder, photographs, downscale, smaller if downscale > 1 and smaller.is_dir() else None, dict(left_out)
-    )
+    return Source(found.path, photographs, downscale)
 
 
 def _find_folder(
     names: Sequence[str], folder: Path, capture: Path, stated: Path | None, downscale: int, need_photos: bool
 ) -> Path:
     """Find the folder that has most of a model's photographs: `stated`, else one in `capture`. If `capture` is the
-    model's `folder`, those up to three levels above it are searched, too.
-
-    Raises:
-        CaptureError: photographs are needed, and `stated` is missing or no folder has any.
-    """
+    model's `folder`, those up to three levels above it are searched, too. Raises CaptureError: photographs are needed,
+    and `stated` is missing or no folder has any."""
     if stated is not None:
         if not need_photos or (capture / stated).is_dir() or (capture / f"{stated}_{downscale}").is_dir():
             return capture / stated
@@ -121,27 +110,22 @@ def _find_folder(
     folders += [path for path in sorted(capture.iterdir()) if path.is_dir() and not result_in(path)]
     folders += bases
 
-    def with_copies(path: Path) -> list[Path]:
-        return [each for each in (path, path.with_name(f"{path.name}_{downscale}")) if each.is_dir()]
+    def most(path: Path, count: Callable[[Path], int]) -> int:
+        copies = path.with_name(f"{path.name}_{downscale}")
+        return max((count(each) for each in (path, copies) if each.is_dir()), default=0)
 
     portable = [name for name in names if leads_inside(name)]
-
-    def exact_count(path: Path) -> int:
-        return max((sum(os.path.isfile(each / name) for name in portable) for each in with_copies(path)), default=0)
-
-    best = max(folders, key=exact_count)  # the first of equals
-    if not need_photos or exact_count(best) == len(names):
+    exact = {each: most(each, lambda at: sum(os.path.isfile(at / name) for name in portable)) for each in folders}
+    best = max(folders, key=exact.__getitem__)  # the first of equals
+    if not need_photos or exact[best] == len(names):
         return best
     # a folder above the capture may be the root of a disk, which is not searched
-    searched = [each for each in folders if each.is_relative_to(capture) or each.name in USUAL_FOLDERS]
-    counts = {}
-    for each in dict.fromkeys(searched):
-        found = (FileFinder(one).find_all(names) for one in with_copies(each))
-        counts[each] = max((sum(path is not None for path in files) for files in found), default=0)
+    searched = [each for each in exact if each.is_relative_to(capture) or each.name in USUAL_FOLDERS]
+    counts = {each: most(each, lambda at: len({*FileFinder(at).find_all(names)} - {None})) for each in searched}
     other = max(counts, key=counts.__getitem__)
-    if counts[other] > exact_count(best):
+    if counts[other] > exact[best]:
         return other
-    if exact_count(best) == 0:
+    if exact[best] == 0:
         near = [hint for each in searched if each.is_dir() and (hint := FileFinder(each).nearest(names[0], names))]
         hint = f" ({near[0]})" if near else ""
         fail(
@@ -176,11 +160,11 @@ def warn_left_out(source: Source) -> set[Path]:
 
 def photographs_of(source: Source) -> list[Photograph]:
     """List the photographs of a model in the order of their names, with cameras and poses."""
-    model, found = source.model, []
+    model, reduced, found = source.model, source.image_folder != source.photographs, []
     for image, file in zip(model.images, source.files(), strict=True):
         camera, pose = model.cameras[image.camera_id], TO_Z_UP @ _camera_to_world(image)
         label = f"camera {image.camera_id} of {source.folder}"
-        found.append(Photograph(file, camera, pose, label, None, source.copies is not None, image.frame))
+        found.append(Photograph(file, camera, pose, label, None, reduced, image.frame))
     return found
 
 

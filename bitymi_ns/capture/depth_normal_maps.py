@@ -83,11 +83,8 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
     """Read camera z [H, W] for the pinhole picture of a lens, by nearest neighbors; 0 = unknown.
 
     Integers are millimetres, 0 and the largest one unknown. Floating-point numbers are metres; unknown unless finite,
-    above 0 and below 65,504. A confidence of 0 means unknown. `unit` overrides the metres per unit.
-
-    Raises:
-        CaptureError: a file cannot be read, or has another shape than the photograph.
-    """
+    above 0 and below 65,504. A confidence of 0 means unknown. `unit` overrides the metres per unit. Raises
+    CaptureError: a file cannot be read, or has another shape than the photograph."""
     assert files.depth is not None
     stored = _read(files.depth, lens.stored)
     if stored.ndim != 2:
@@ -105,12 +102,9 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
 def read_normal(files: MapFiles, lens: Lens) -> Values:
     """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown.
 
-    Files hold them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers, or colors
-    (n + 1) / 2 with black for unknown.
-
-    Raises:
-        CaptureError: a file cannot be read, or has another shape than the photograph.
-    """
+    Files hold them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers, or colors (n
+    + 1) / 2 with black for unknown. Raises CaptureError: a file cannot be read, or has another shape than the
+    photograph."""
     assert files.normal is not None
     stored = _read(files.normal, lens.stored)
     if stored.ndim != 3 or stored.shape[2] < 3:

@@ -286,18 +286,13 @@ def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> l
     found = [next((copy for copy in copies(each.file) if os.path.isfile(copy)), None) for each in photographs]
     if not any(found):
         return photographs
-    lacking = [copies(each.file)[0] for each, copy in zip(photographs, found, strict=True) if copy is None]
-    if lacking:
-        fail(
-            f"{len(lacking)} of {len(found)} images of the capture are missing:\n  {listed(lacking)}\nOthers have a "
-            f"copy {downscale} times smaller: make the missing ones, or move that folder away to reduce all on reading."
-        )
+    found = [copy or copies(each.file)[0] for each, copy in zip(photographs, found, strict=True)]  # some are missing
     if len(set(found)) < len(set(each.file for each in photographs)):
         twins = sorted({each.file.relative_to(folder).as_posix() for each, copy in zip(photographs, found, strict=True)
                         if found.count(copy) > 1})  # fmt: skip
         fail(
-            f"{listed(twins)} have the same names in different folders, but {found[0].parent} can have one of each "  # type: ignore[union-attr]
+            f"{listed(twins)} have the same names in different folders, but {found[0].parent} can have one of each "
             "alone. Use the photographs as they are (`bitymi-data --downscale-factor 1`), or give them different names."
         )
     return [replace(each, file=copy, mask=mask_copy(each.mask), downscaled=True)
-            for each, copy in zip(photographs, found, strict=True) if copy is not None]  # fmt: skip
+            for each, copy in zip(photographs, found, strict=True)]  # fmt: skip

@@ -12,23 +12,8 @@ from pathlib import Path
 import pillow_heif
 from PIL import Image
 
-from bitymi_ns.capture.kinds import (
-    BUNDLE,
-    FILM,
-    FOLDERS,
-    IMAGES_OF,
-    PHOTOGRAPHS,
-    PICTURES,
-    POSES,
-    RENDERED,
-    RENDERS,
-    RESULTS,
-    RUN,
-    SPLITS,
-    UNREAD,
-    VIDEOS,
-    Kind,
-)  # fmt: skip
+from bitymi_ns.capture import kinds
+from bitymi_ns.capture.kinds import Kind
 from bitymi_ns.safe_reading import MOST_TEXT, open_regular
 from bitymi_ns.trust import listed
 
@@ -82,7 +67,7 @@ def kind_of(path: Path, rows: Iterable[Kind], beside: Collection[str] = ()) -> K
 
 def is_picture(path: Path) -> bool:
     """Test for a file with a photograph's extension that is not hidden."""
-    return path.suffix.lower() in PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
+    return path.suffix.lower() in kinds.PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
 
 def look_in(folder: Path, among: Collection[Path] | None = None) -> Iterator[tuple[Path, Kind | None]]:
@@ -103,11 +88,12 @@ def _files(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, Kind | No
     stems = {path.stem.lower() for path in pictures}
     beside = stems | {path.name.lower() for path in pictures}
     for path in pictures:
-        yield path, kind_of(path, PICTURES, beside) or (RENDERS if holds(path, RENDERED, COMMENT) else None)
+        rendered = kinds.RENDERS if holds(path, kinds.RENDERED, COMMENT) else None
+        yield path, kind_of(path, kinds.PICTURES, beside) or rendered
     for path in paths:
         if is_rendered_film(path):
-            yield path, FILM
-        elif path.stem.lower() not in stems and (unread := kind_of(path, UNREAD)):
+            yield path, kinds.FILM
+        elif path.stem.lower() not in stems and (unread := kind_of(path, kinds.UNREAD)):
             yield path, unread
 
 
@@ -116,7 +102,7 @@ def _left_out(parent: Path, below: Collection[str]) -> dict[str, Kind]:
     are left out, because they hold copies of these."""
     names, found, captures = {name.lower() for name in below}, {}, []
     for path in sorted(parent / name for name in below):
-        kind = HIDDEN if path.name.startswith(".") else kind_of(path, FOLDERS, names) or result_in(path)
+        kind = HIDDEN if path.name.startswith(".") else kind_of(path, kinds.FOLDERS, names) or result_in(path)
         if kind:
             found[path.name] = kind
         elif holds(path / "transforms.json", b'"transform_matrix"'):
@@ -165,13 +151,13 @@ def unreadable_in(folder: Path) -> str:
 
 def videos_in(folder: Path, rendered: bool = False) -> list[Path]:
     """List a folder's videos that are not hidden; `rendered`: films of ns-render instead."""
-    names = (path for path in folder.iterdir() if path.suffix.lower() in VIDEOS and not path.name.startswith("."))
+    names = (path for path in folder.iterdir() if path.suffix.lower() in kinds.VIDEOS and not path.name.startswith("."))
     return sorted(path for path in names if path.is_file() and is_rendered_film(path) is rendered)
 
 
 def is_rendered_film(path: Path) -> bool:
     """Test for a film that ns-render wrote."""
-    return path.suffix.lower() in VIDEOS and holds(path, RENDERED)
+    return path.suffix.lower() in kinds.VIDEOS and holds(path, kinds.RENDERED)
 
 
 def passed_over(folder: Path, used: Collection[Path] | None = None, copies: str | None = None) -> list[str]:
@@ -188,7 +174,7 @@ def passed_over(folder: Path, used: Collection[Path] | None = None, copies: str 
             if count and not (copies and path.name.endswith(copies)):
                 found.append(f"{path.relative_to(folder)} ({kind.what}: {count}{_use(kind)})")
         elif path not in (used or ()) and (used is not None or kind is not None):
-            groups[kind, path.parent, path.suffix.lower() if kind in UNREAD else ""].append(path)
+            groups[kind, path.parent, path.suffix.lower() if kind in kinds.UNREAD else ""].append(path)
     for (kind, parent, ending), paths in groups.items():
         if kind is None:
             found.append(f"pictures of {parent} that nothing names ({listed([path.name for path in paths], most=2)})")
@@ -209,19 +195,19 @@ def result_in(folder: Path) -> Kind | None:
         names = sorted(os.listdir(folder))
     except OSError:  # unreadable folders are allowed
         return None
-    rows = [row for row in RESULTS if row is not RENDERS or folder.name in SPLITS]
+    rows = [row for row in kinds.RESULTS if row is not kinds.RENDERS or folder.name in kinds.SPLITS]
     if found := next(filter(None, (kind_of(folder / name, rows) for name in names)), None):
         return found
     pictures = [name for name in names if name.endswith((".jpg", ".png"))]
     if pictures and re.fullmatch(r"eval_img_\d{4,}\.png", pictures[-1]) and pictures[0].startswith("eval_"):
         return EVALUATED
-    rendered = pictures and all(holds(folder / pictures[i], RENDERED, COMMENT) for i in (0, -1))
-    return RENDERS if rendered else None
+    rendered = pictures and all(holds(folder / pictures[i], kinds.RENDERED, COMMENT) for i in (0, -1))
+    return kinds.RENDERS if rendered else None
 
 
 def images_of(model: Path) -> list[Path]:
     """List the folders of pictures that belong to a COLMAP model by the table, the likeliest first."""
-    path, found = os.path.abspath(model), ((_pattern(row.names), row.what) for row in IMAGES_OF)
+    path, found = os.path.abspath(model), ((_pattern(row.names), row.what) for row in kinds.IMAGES_OF)
     matches = [(pattern.match(path), what) for pattern, what in found]
     return [Path(what.replace("NAME", next(filter(None, match.groups())))) for match, what in matches if match]
 
@@ -229,10 +215,10 @@ def images_of(model: Path) -> list[Path]:
 def refusal(folder: Path) -> str:
     """Say why a folder cannot be trained on, and what to do, if it is a bundle or a run; empty = it can."""
     what = result_in(folder) if folder.is_dir() else None
-    if what is BUNDLE:
+    if what is kinds.BUNDLE:
         bundle = f"{folder} is a bundle, not a capture: give the folder of its photographs."
         return f"{bundle} `bitymi view {folder}` shows the bundle."
-    if what is RUN:
+    if what is kinds.RUN:
         advice = f"give the folder of its photographs, and --load-dir {folder}/nerfstudio_models to go on with the run."
         return f"{folder} is a training run, not a capture: {advice}"
     return ""
@@ -243,7 +229,7 @@ def poses_in(folder: Path) -> tuple[str, ...]:
     found: dict[Kind, list[Path]] = defaultdict(list)
     for where in (folder, *sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")):
         for path in sorted(where.iterdir()) if os.access(where, os.R_OK) and not result_in(where) else ():
-            if path.is_file() and (kind := kind_of(path, POSES)):
+            if path.is_file() and (kind := kind_of(path, kinds.POSES)):
                 found[kind].append(path)
     described = []
     for kind, paths in found.items():

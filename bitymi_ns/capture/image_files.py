@@ -17,7 +17,6 @@ from PIL import EpsImagePlugin, ExifTags, Image, ImageCms
 from bitymi_ns.capture.exif import exif_stops, exposure_settings
 from bitymi_ns.capture.folder_contents import open_picture
 from bitymi_ns.capture.types import fail, parsing
-from bitymi_ns.trust import listed
 
 S, T = TypeVar("S"), TypeVar("T")
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
@@ -88,39 +87,14 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
     ]
 
 
-def check_sizes(paths: Sequence[Path]) -> None:
-    """Fail if the header of a photograph states more than MAX_PIXELS."""
-
-    def too_large(path: Path) -> bool:
-        try:
-            with open_picture(path):
-                return False
-        except Image.DecompressionBombError:
-            return True
-        except Exception:
-            return False  # reported where the file is read
-
-    large = [path for path, refused in zip(paths, in_threads(too_large, paths), strict=True) if refused]
-    if large:
-        fail(_too_large(large))
-
-
-def _too_large(paths: Sequence[Path]) -> str:
-    camera = "w, h, fl_x, fl_y, cx and cy of its camera"
-    return f"{listed(paths)} has more than {MAX_PIXELS:,} pixels. Make it smaller, and {camera} with it."
-
-
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
     """Read a photograph as 8-bit sRGB, mode RGB, or RGBA with transparency. Grey of more than 8 bits, which PIL would
-    clip to white, is scaled to 8 bits.
+    clip to white, is scaled to 8 bits. Raises CaptureError: it is missing, cannot be read, or has another size.
 
     Args:
         stored: width and height that it must have; None = any.
         wanted: width and height to which it is downscaled, averaging over pixels. A JPEG is decoded at a half, a
             quarter or an eighth of its size if that is at least twice as large, to average over 2 x 2 or more.
-
-    Raises:
-        CaptureError: it is missing, cannot be read, or has another size.
     """
     try:
         with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
@@ -136,7 +110,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
     except Image.DecompressionBombError as error:
-        fail(_too_large([path]), error)
+        camera = "w, h, fl_x, fl_y, cx and cy of its camera"
+        fail(f"{path} has more than {MAX_PIXELS:,} pixels. Make it smaller, and {camera} with it.", error)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:

@@ -73,6 +73,12 @@ UNREAD = (
     Kind("*.insv *.360", "a film of two fisheyes", use="export a 360-degree MP4 with the camera's program"),
 )
 """Images and films that cannot be read."""
+OTHERS = (
+    Kind("*.bitymi", "a bundle in one file, not a capture", use="give the folder of its photographs"),
+    Kind("*.zip *.tar *.7z *.gz *.rar", "an archive", use="unpack it, and give the folder"),
+    Kind("meta_data.json", "of sdfstudio", use="give `sdfstudio-data` after the options of the method"),
+)
+"""Files that are no captures, but lead to some."""
 _PROCESS = "`ns-process-data {0} --num-downscales 0 --output-dir NEW` converts it"
 _COLMAP = "`{0}` writes a COLMAP model"
 _MATRICES = "write each as 4 x 4 numbers, camera to world with OpenCV axes, to `pose/NAME.txt` beside `rgb/NAME.png`"

@@ -30,15 +30,12 @@ def triangulate(
     capture: Path, views: Sequence[Photograph], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
     """Triangulate points from photographs with known cameras, in pixels of the files, which are not refined. The model
-    is cached, and an interrupted run resumed, in the folder `capture` as by `find_poses`.
+    is cached, and an interrupted run resumed, in the folder `capture` as by `find_poses`. Raises CaptureError: too few
+    points can be found; says what may be wrong; KeyboardInterrupt: Ctrl-C; what is done is kept.
 
     Returns:
         folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the poses, with image names
         relative to `capture`.
-
-    Raises:
-        CaptureError: too few points can be found; says what may be wrong.
-        KeyboardInterrupt: Ctrl-C; what is done is kept.
     """
     missing = [view.file for view in views if not os.path.isfile(view.file)]
     if missing:

@@ -160,7 +160,8 @@ class Lens:
 
 
 def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
-    """Choose the pinhole picture of a camera, or faces of a cube if it is wider than MAX_VIEW_ANGLE.
+    """Choose the pinhole picture of a camera, or faces of a cube if it is wider than MAX_VIEW_ANGLE. Raises
+    CaptureError: the camera cannot be used.
 
     Args:
         colmap: for the size to which photographs are downscaled.
@@ -168,9 +169,6 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
 
     Returns:
         the lenses, and messages on what photographs become.
-
-    Raises:
-        CaptureError: the camera cannot be used.
     """
     model, width, height, params = colmap
     camera = colmap.colmap
@@ -340,16 +338,14 @@ def _field(camera: ColmapCamera) -> float:
 
 
 def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
-    """Convert nerfstudio's camera type, see `transforms.CAMERA_TYPES`, and its distortion_params to COLMAP's.
+    """Convert nerfstudio's camera type, see `transforms.CAMERA_TYPES`, and its distortion_params to COLMAP's. Raises
+    CaptureError: COLMAP has no such camera, or `values` are too many or too few.
 
     Args:
         values: k1, k2, k3, k4, p1, p2; twelve of FISHEYE624.
 
     Returns:
         camera model with separate focal lengths, and its parameters after fx, fy, cx, cy (none if SPHERICAL_MODEL).
-
-    Raises:
-        CaptureError: COLMAP has no such camera, or `values` are too many or too few.
     """
     if kind == "EQUIRECTANGULAR":
         return SPHERICAL_MODEL, ()

@@ -30,11 +30,8 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
     in `data`; else that of reduced masks (`masks_2` for a `downscale` of 2).
 
     If `data` is the folder of photographs, or in it, a `masks` beside it may belong to something else. It is used if
-    the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`.
-
-    Raises:
-        CaptureError: neither the stated one nor its reduced one exists.
-    """
+    the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`. Raises CaptureError:
+    neither the stated one nor its reduced one exists."""
     shown, named = Path(os.path.abspath(photographs)), Path(os.path.abspath(data))
     folders = [shown, named]
     if shown.name in USUAL_FOLDERS or not named.is_relative_to(shown):
@@ -121,15 +118,13 @@ def with_masks(
     downscale: int = 1,
     images: Path | None = None,
 ) -> list[Photograph]:
-    """Add masks to photographs, see `find_masks`, and report it. Masks beside photographs may be some.
+    """Add masks to photographs, see `find_masks`, and report it. Masks beside photographs may be some. Raises
+    CaptureError: the folder has masks of some photographs only, or of none and is stated or that of a model.
 
     Args:
         base: folder of the photographs, whose paths in it name the masks; None = their common folder.
         stated: folder of masks, relative to the capture; None = see `mask_folder`.
         images: folder of a model's files, which have the names of those in `base`; None = no model, `base`.
-
-    Raises:
-        CaptureError: the folder has masks of some photographs only, or of none and is stated or that of a model.
     """
     files = [each.file for each in photographs]
     base = base or Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))

@@ -41,15 +41,12 @@ def find_poses(
     source: Path, options: SfmOptions | None = None, progress: Progress | None = None, warn: Tell = warnings.warn
 ) -> FoundPoses:
     """Find camera poses of photographs or of a video's frames; cache them beside the photographs, or in the user's
-    cache folder if nothing can be written there; continue an interrupted run.
+    cache folder if nothing can be written there; continue an interrupted run. Raises CaptureError: no poses can be
+    found; says what to photograph differently; KeyboardInterrupt: Ctrl-C; what is done is kept.
 
     Args:
         source: a folder of photographs, a folder with `images` (and `masks`), or a video.
         warn: called with the location of the result if not beside writable photographs.
-
-    Raises:
-        CaptureError: no poses can be found; says what to photograph differently.
-        KeyboardInterrupt: Ctrl-C; what is done is kept.
     """
     options = options or SfmOptions()
     tell = progress or no_progress

@@ -144,14 +144,12 @@ class Capture:
 
 
 def read_capture(options: CaptureOptions, need_photos: bool = True, want_points: bool = True) -> Capture:
-    """Read a capture of any format, and check all that its files state.
+    """Read a capture of any format, and check all that its files state. Raises CaptureError: it cannot be used; names
+    the file and the entry, and says what to do.
 
     Args:
         need_photos: fail if photographs are missing; else their files are not opened.
         want_points: a scene starts from the points: color them, and triangulate missing ones.
-
-    Raises:
-        CaptureError: it cannot be used; names the file and the entry, and says what to do.
     """
     return _Reader(options, options.find(), need_photos, want_points).read()
 

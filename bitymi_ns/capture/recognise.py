@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bitymi_ns.capture import folder_contents
-from bitymi_ns.capture.kinds import PHOTOGRAPHS, UNREAD, VIDEOS
+from bitymi_ns.capture.kinds import OTHERS, PHOTOGRAPHS, UNREAD, VIDEOS
 from bitymi_ns.capture.types import fail
 from bitymi_ns.safe_reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
@@ -56,15 +56,12 @@ class Found:
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
-    """Recognize the capture at a path.
+    """Recognize the capture at a path. Raises CaptureError: there is none of that format.
 
     Args:
         data: a folder, or a file: transforms.json, a video, or a file of a COLMAP model.
         format: to search for; auto = any, files with poses before photographs without.
         colmap_path: folder of a COLMAP model, relative to the capture.
-
-    Raises:
-        CaptureError: there is none of that format.
     """
     if not data.exists():
         fail(f"the capture {data} does not exist. Give a folder or a file with --data.")
@@ -254,29 +251,23 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         there = f" It holds {held}: leave --format out." if candidates else ""
         return f"{data} holds nothing of the format {format}.{there}"
     if not data.is_dir():
-        if data.suffix.lower() == ".bitymi":
-            return f"{data} is a bundle in one file, not a capture: give the folder of its photographs."
-        if data.suffix.lower() in (".zip", ".tar", ".7z", ".gz", ".rar"):
-            return f"{data} is an archive. Unpack it, and give the folder."
         if data.suffix.lower() in PHOTOGRAPHS:
             return f"{data} is one photograph. A scene needs many: give the folder that holds them."
-        if unread := folder_contents.kind_of(data, UNREAD):
-            return f"{data} cannot be read: it is {unread.what}. To have it used, {unread.use}."
+        if kind := folder_contents.kind_of(data, (*OTHERS, *UNREAD)):
+            return f"{data} is {kind.what}: {kind.use}."
         return (
             f"{data} is no file that can be trained on. Give a folder of photographs, a video "
             f"({', '.join(VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
         )
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
-    other = (data / "meta_data.json").is_file()
-    hint = " It has a meta_data.json: give `sdfstudio-data` after the options of the method." if other else ""
-    several = captures_in(data)
+    hint, several = "", captures_in(data)
+    known = [(path.name, kind) for path in data.iterdir() if (kind := folder_contents.kind_of(path, OTHERS))]
     if several:
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
-    archive = next((path for path in sorted(data.iterdir()) if path.suffix.lower() in (".zip", ".tar", ".7z")), None)
-    if archive is not None and not several:
-        hint = f" Unpack {archive.name} first."
-    if not hint and (others := folder_contents.passed_over(data)):
+    elif known:
+        hint = f" {known[0][0]} is {known[0][1].what}: {known[0][1].use}."
+    elif others := folder_contents.passed_over(data):
         hint = f" It holds what is not taken for photographs: {listed(others)}."
     return (
         f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
-from bitymi_ns.capture.colmap_views import Origin, Source, make_source
+from bitymi_ns.capture.colmap_views import Origin, Source
 from bitymi_ns.capture.folder_contents import passed_over, photo_folder, videos_in
 from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
@@ -72,7 +72,7 @@ def find_sfm_source(
         say(by_gps)
     if poses.doubt:
         warn(poses.doubt)
-    source = make_source(poses.model, poses.images, downscale, poses.left_out)
+    source = Source(poses.model, poses.images, downscale, poses.left_out)
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames are in the work folder
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
@@ -85,12 +85,12 @@ def kept_source(found: Found, kept: KeptPoses, downscale: int, need_photos: bool
     changed their size."""
     photographs = kept.origin.photographs
     images = kept.folder / IMAGES if photographs is None else found.folder / photographs
-    source = make_source(kept.folder / MODEL, images, downscale, kept.left_out)
+    source = Source(kept.folder / MODEL, images, downscale, kept.left_out)
     if need_photos:
         files = source.files()
         missing = [file.readlink() if file.is_symlink() else file for file in files if not os.path.isfile(file)]
         changed = []
-        sizes = in_threads(image_size, files) if source.copies is None else [None] * len(files)
+        sizes = in_threads(image_size, files) if source.image_folder == images else [None] * len(files)
         for image, file, size in zip(source.model.images, files, sizes, strict=True):
             camera = source.model.cameras[image.camera_id]
             if size not in (None, camera.size):

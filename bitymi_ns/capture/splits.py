@@ -1,6 +1,5 @@
 """Split a capture into training and held-out photographs: by rule, or by names."""
 
-import hashlib
 import math
 import os
 from collections.abc import Sequence
@@ -159,14 +158,6 @@ def lists_by_name(files: Sequence[Path]) -> NameLists:
 
 
 Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
-
-
-def duplicate_files(train: Sequence[Path], held_out: Sequence[Path]) -> list[Pair]:
-    """Pair files of the same bytes, reading only files of equal size."""
-    sizes = {path: path.stat().st_size for path in (*train, *held_out)}
-    shared = {sizes[path] for path in train} & {sizes[path] for path in held_out}
-    digest = {path: hashlib.sha256(path.read_bytes()).digest() for path, size in sizes.items() if size in shared}
-    return duplicates(*([digest.get(path) for path in paths] for paths in (train, held_out)))
 
 
 def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:

@@ -137,7 +137,7 @@ def test_a_video_alone_beside_photographs_or_in_a_folder(tmp_path: Path) -> None
     [
         ([], "is empty. Give a folder of photographs"),
         (["notes.odt"], "holds nothing to train on: no transforms.json"),
-        (["photos.zip"], "Unpack photos.zip first"),
+        (["photos.zip"], "photos.zip is an archive: unpack it"),
         (["meta_data.json"], "give `sdfstudio-data` after the options"),
         (["masks/a.png"], "holds nothing to train on"),
     ],
@@ -155,7 +155,7 @@ def test_files_that_cannot_be_trained_on(tmp_path: Path) -> None:
     photograph(tmp_path, "a.zip")
     for name, message in (
         ("a.jpg", "is one photograph"), ("a.odt", "no file that can be"), ("b", "does not exist"),
-        ("a.zip", "a.zip is an archive. Unpack it"),
+        ("a.zip", "a.zip is an archive: unpack it"),
     ):  # fmt: skip
         with pytest.raises(CaptureError, match=message):
             recognise(tmp_path / name)

@@ -153,9 +153,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         check_outliers(poses[:, :, 3], names)
         every = list(dict.fromkeys([*files[0], *files[1]]))
         check_photographs_exist(self.get_datapath(), every)
-        image_files.check_sizes(every)
-        self._duplicates = splits.duplicate_files(*files)
-        splits.warn_of_duplicates(self._duplicates, train, held_out)
         if count == 1 and test_mode == "val":
             one = f"only one training view in {self.config.data}"
             fail(f"{one}. A scene cannot be learned from one image: take photographs from more sides.")
@@ -206,11 +203,9 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
             fail(f"there is nothing to learn from the {len(train)} training photographs: {what}.")
         for reason, paths in empty.items():
             warn(f"Of {len(train)} training photographs {len(paths)} show nothing, {reason}: {listed(paths)}.")
-        reported = {j for _, j in self._duplicates}
         summaries = [[d.summary(i) for i in range(len(d))] for d in (train, held_out)]
         fingerprints = [[None if each.empty else each.fingerprint for each in some] for some in summaries]
-        pairs = [pair for pair in splits.duplicates(*fingerprints) if pair[1] not in reported]
-        splits.warn_of_duplicates(pairs, train.image_filenames, held_out.image_filenames)
+        splits.warn_of_duplicates(splits.duplicates(*fingerprints), train.image_filenames, held_out.image_filenames)
 
     @cached_property
     def _budget(self) -> MemoryBudget:

@@ -167,7 +167,7 @@ def test_what_is_remembered_of_a_photograph(picture: np.ndarray) -> None:
 def test_the_same_photograph_on_both_sides(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     paths = images_of(capture)
     shutil.copy(paths[0], paths[3])
-    load(capture)
+    checked(capture)
     message = printed(capsys)
     assert "1 of 2 held-out photographs are training photographs, too" in message
     assert f"{paths[0]} = {paths[3]}" in message and "remove the duplicates" in message
@@ -179,10 +179,10 @@ def test_the_same_photograph_on_both_sides(capture: Path, capsys: pytest.Capture
 
 def test_a_frame_that_is_listed_twice(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit(capture, lambda meta: meta["frames"].insert(1, dict(meta["frames"][0])))
-    load(capture)
+    checked(capture)
     first = images_of(capture)[0]
     assert f"{first} = {first}" in printed(capsys)
-    load(capture, eval_mode="all")
+    load(capture, eval_mode="all").check_pictures()
     assert "held-out photographs are" not in printed(capsys)
 
 
@@ -217,7 +217,7 @@ def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
     assert len(manager.train_dataset) == 10
     declared(path, 60000, 60000)
     with expect(f"{path.name} has more than 1,000,000,000 pixels. Make it smaller"):
-        load(capture)
+        checked(capture)
 
 
 def test_colors_are_those_of_screens(tmp_path: Path) -> None:

@@ -172,11 +172,9 @@ def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
         count = parameter_count(camera.model)
         if not all(1 <= side <= MAX_SIDE for side in camera.size) or not np.isfinite(camera.params).all():
             written = " ".join([*(str(side)[:20] for side in camera.size), *(f"{value:g}" for value in camera.params)])
-            line, what = _line_of(path, number), f"camera {number} ({camera.model} {written})"
-            fail(
-                f"{path}{line}: {what} cannot be used: its size has to be from 1 to {MAX_SIDE:,} pixels and all "
-                "numbers finite. Correct it, or export the model from COLMAP again."
-            )
+            needs = f"its size has to be from 1 to {MAX_SIDE:,} pixels and all numbers finite"
+            what = f"camera {number} ({camera.model} {written}) cannot be used"
+            fail(f"{path}: {what}: {needs}. Correct it, or export the model from COLMAP again.")
         if count is not None and len(camera.params) != count:
             what = f"camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}"
             fail(f"{path}: {what}. Correct its line.")
@@ -195,21 +193,12 @@ def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, 
             )
         if not np.isfinite([*image.qvec, *image.tvec]).all() or not TINY < np.linalg.norm(image.qvec) < 1.0 / TINY:
             fail(
-                f"{path}{_line_of(path, number)}: the pose of image {number} ({image.name}) is not finite, or its "
+                f"{path}: the pose of image {number} ({image.name}) is not finite, or its "
                 "rotation is zero. Correct its line or remove the image."
             )
         if first.setdefault(image.name, number) != number:
             twice = f"images {first[image.name]} and {number} are both of {image.name}"
             fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
-
-
-def _line_of(path: Path, number: int) -> str:
-    """Find the line of a text file with this camera or image, as ", line N"; empty for a binary file."""
-    if path.suffix != ".txt":
-        return ""
-    with open_text(path, errors="replace") as file:
-        lines = [i for i, line in enumerate(file, 1) if line.split()[:1] == [str(number)]]
-    return f", line {lines[0]}" if lines else ""
 
 
 class _Binary:

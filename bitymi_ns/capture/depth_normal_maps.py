@@ -2,7 +2,6 @@
 
 import math
 import os
-import struct
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -32,7 +31,6 @@ FARTHEST = 65504.0  # depth from which on numbers mean "no depth": the largest h
 Check = Callable[[tuple[int, ...]], None]
 """Receives a header's shape, and raises if it must not be read."""
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-EXR = b"v/1\x01"
 (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(
     0
 )  # a damaged map gets one message, without OpenCV's
@@ -141,8 +139,7 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
             values = read_array(path, check)
             values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
         else:
-            check(image_shape(path))
-            values = _read_exr(path) if path.suffix.lower() == ".exr" else _read_by_opencv(path)
+            values = (_read_exr if path.suffix.lower() == ".exr" else _read_by_opencv)(path, check)
             check(values.shape)
             if values.ndim == 3 and not _channels_differ(values):
                 values = values[..., 0]  # depth, written as grey
@@ -151,24 +148,27 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
     return values.astype(np.float32) if values.dtype.itemsize > 4 or values.dtype == np.float16 else values
 
 
-def _read_by_opencv(path: Path) -> npt.NDArray[np.generic]:
+def _read_by_opencv(path: Path, check: Check) -> npt.NDArray[np.generic]:
+    check(image_shape(path))
     values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if values is None:
         raise ValueError("it is no image that OpenCV reads")
     return values if values.ndim == 2 else values[..., 2::-1]  # BGR, BGRA
 
 
-def _read_exr(path: Path) -> npt.NDArray[np.generic]:
+def _read_exr(path: Path, check: Check) -> npt.NDArray[np.generic]:
     import OpenEXR  # OpenCV 5 reads no such files, and 4 reads a channel Z as zeros
 
     with open_regular(path) as file:
         image = OpenEXR.InputFile(file)
-        kinds = {name: ("u4", "f2", "f4")[channel.type.v] for name, channel in image.header()["channels"].items()}
+        box, channels = image.header()["dataWindow"], image.header()["channels"]
+        shape = (box.max.y - box.min.y + 1, box.max.x - box.min.x + 1)
+        check(shape)
+        kinds = {name: ("u4", "f2", "f4")[channel.type.v] for name, channel in channels.items()}
         names = next(each for each in ("RGB", "Y", "Z", list(kinds)) if kinds.keys() >= set(each))
         if len(names) != 1 and names != "RGB":
             raise ValueError(f"R, G and B, Y, Z or a single channel are read, and it has {', '.join(kinds)}")
         planes = zip(names, image.channels(list(names)), strict=True)
-        shape = image_shape(path)
         values = np.stack([np.frombuffer(plane, kinds[name]).reshape(shape) for name, plane in planes], axis=-1)
     return values if len(names) == 3 else values[..., 0]
 
@@ -208,9 +208,6 @@ def image_shape(path: Path) -> tuple[int, int]:
     """Read height and width of an image for OpenCV from its header. Raises OSError, ValueError: it is none."""
     with open_regular(path) as file:
         start = file.read(16)
-        if start.startswith(EXR):
-            file.seek(8)
-            return _exr_shape(file)
         if start.startswith(TIFFS):
             entries = TiffImagePlugin.ImageFileDirectory_v2(start if start[2:4] in (b"+\0", b"\0+") else start[:8])
             file.seek(entries.next)
@@ -218,25 +215,3 @@ def image_shape(path: Path) -> tuple[int, int]:
             return int(entries[TiffImagePlugin.IMAGELENGTH]), int(entries[TiffImagePlugin.IMAGEWIDTH])
     with open_picture(path) as image:
         return image.size[1], image.size[0]
-
-
-def _exr_shape(file: IO[bytes]) -> tuple[int, int]:
-    """Find the data window among the attributes: zero-terminated name and type, size, value."""
-    size = os.fstat(file.fileno()).st_size
-    while file.tell() < size:
-        name, kind = _text(file), _text(file)
-        (count,) = struct.unpack("<I", _whole(file, 4))
-        if (name, kind, count) == (b"dataWindow", b"box2i", 16):
-            left, top, right, bottom = struct.unpack("<4i", _whole(file, 16))
-            return bottom - top + 1, right - left + 1
-        file.seek(count, os.SEEK_CUR)
-    raise ValueError("it has no data window")
-
-
-def _text(file: IO[bytes]) -> bytes:
-    text = b""
-    while (letter := _whole(file, 1)) != b"\0":
-        text += letter
-        if len(text) > 255:
-            raise ValueError("a name in its header has no end")
-    return text

@@ -354,12 +354,9 @@ def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[s
             f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
             f"which are the kinds that can be trained on, but {kind}. Correct the capture."
         )
-    counts, needs = {
-        "PERSPECTIVE": ((6,), "perspective cameras need six: k1, k2, k3, k4, p1, p2"),
-        "FISHEYE": ((4, 6), "fisheye cameras need four: k1, k2, k3, k4"),
-        "FISHEYE624": ((12,), "FISHEYE624 needs twelve"),
-    }[kind]
+    counts = {"PERSPECTIVE": (6,), "FISHEYE": (4, 6), "FISHEYE624": (12,)}[kind]
     if len(values) not in counts:
+        needs = f"{kind.lower()} cameras need {counts[0]} (k1, k2, k3, k4, then p1, p2)"
         fail(f"the camera {label} has {len(values)} distortion_params; {needs}. Correct the capture.")
     if kind == "FISHEYE624":
         return "RAD_TAN_THIN_PRISM_FISHEYE", tuple(values)

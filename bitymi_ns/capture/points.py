@@ -4,9 +4,7 @@ nerfstudio's PLY reader returns uninitialized memory for missing points, and div
 [0, 1].
 """
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,7 +21,6 @@ Array = npt.NDArray[np.float64]
 VERTEX = "vertex"
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of color properties in PLY files."""
-MANY_POINTS = 500_000  # points from which on slow steps are announced and timed
 COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
 COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
@@ -52,18 +49,6 @@ def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.ND
     if white is None or low < 0.0:
         return none, f"its colors lie between {low:g} and {high:g}, which is neither 0 to 1 nor 0 to 255 nor 0 to 65535"
     return np.uint8(values * (255.0 / white) + 0.5), ""
-
-
-@contextmanager
-def reporting_time(what: str, points: int) -> Iterator[None]:
-    """Announce and time a step on many points."""
-    if points < MANY_POINTS:
-        yield
-        return
-    say(f"{what} {points:,} points. This may take minutes.")
-    start = time.perf_counter()
-    yield
-    say(f"{what} {points:,} points took {time.perf_counter() - start:.1f} s.")
 
 
 def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:

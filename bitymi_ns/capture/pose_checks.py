@@ -67,7 +67,8 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
 
 
 def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Check the poses of a transforms.json's frames, and replace them by rotations, see `rotations`."""
+    """Check the poses of a transforms.json's frames, one for each photograph, and replace them by rotations, see
+    `rotations`."""
     names = [frame["file_path"] for frame in frames]
     poses, scaled = [], []
     for frame, name in zip(frames, names, strict=True):
@@ -87,20 +88,13 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
         say(f"{path}: the transform_matrix of {listed(scaled)} is divided by its last number, which is not 1.")
     matrices = np.stack(poses)
     matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
-    for frame, pose in zip(frames, matrices, strict=True):
-        frame["transform_matrix"] = pose.tolist()
-
-
-def check_repeated(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Fail if a photograph has two poses."""
     first: dict[str, int] = {}
-    for i, frame in enumerate(frames):
-        name = os.path.normpath(frame["file_path"])
+    for i, (frame, pose, name) in enumerate(zip(frames, matrices, map(os.path.normpath, names), strict=True)):
         before = first.setdefault(name, i)
-        poses = [np.asarray(frames[j]["transform_matrix"]) for j in (before, i)]
-        if before != i and not np.allclose(*poses, rtol=1e-5, atol=1e-5):
+        if not np.allclose(matrices[before], pose, rtol=1e-5, atol=1e-5):
             twice = f"frames {before} and {i} (counted from 0) are both of {name}, but with different poses"
             fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
+        frame["transform_matrix"] = pose.tolist()
 
 
 def as_matrix(value: Any) -> np.ndarray | None:

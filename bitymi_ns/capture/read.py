@@ -253,7 +253,8 @@ class _Reader:
         own = model_points(model, TO_Z_UP)
         if need_photos and self.want_points and options.points == "auto":
             own = self._colored(own, model.without_colors, photographs, source.folder)
-        points, lists = self._points(own, photographs, where), read_split_lists(found.folder, source.folder)
+        points = self._points(own, photographs, where)
+        lists = read_split_lists(found.folder, source.folder, [each.file for each in photographs])
         return Capture(
             found.format, where, photographs, points, options, lists, {}, source.downscale, TO_Z_UP,
             report=source.report, model=None if source.origin is None else source,

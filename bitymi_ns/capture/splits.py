@@ -139,13 +139,19 @@ def _names_in(path: Path, what: object) -> list[str]:
         return [line.strip() for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
 
 
-def read_split_lists(folder: Path, model: Path) -> NameLists:
+def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLists:
     """Read the lists of names of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`; else
-    3DGS's `test.txt` in the model's folder."""
+    3DGS's `test.txt` in the model's folder, which may name more than the photographs' `files`."""
     of_split = (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test"))
-    files = [(split, folder / f"{name}_list.txt") for split, name in of_split]
-    found, test = {split: _names_in(path, path) for split, path in files if path.is_file()}, model / "test.txt"
-    return NameLists({"test": _names_in(test, test)}, str(test)) if not found and test.is_file() else NameLists(found)
+    stated = [(split, folder / f"{name}_list.txt") for split, name in of_split]
+    found, test = {split: _names_in(path, path) for split, path in stated if path.is_file()}, model / "test.txt"
+    if found or not test.is_file():
+        return NameLists(found)
+    there, named = {part for file in files for part in (file.name, file.stem)}, _names_in(test, test)
+    known = [name for name in named if {Path(name).name, Path(name).stem} & there]
+    if len(known) < len(named):
+        warn(f"{test}: {len(named) - len(known)} of {len(named)} names are of no photograph of the capture.")
+    return NameLists({"test": known} if known else {}, str(test))
 
 
 def lists_by_name(files: Sequence[Path]) -> NameLists:

@@ -24,7 +24,7 @@ from bitymi_ns.capture.find_files import (
 from bitymi_ns.capture.image_files import image_size
 from bitymi_ns.capture.lens import colmap_distortion
 from bitymi_ns.capture.masks import with_masks
-from bitymi_ns.capture.pose_checks import as_matrix, check_repeated, correct_poses
+from bitymi_ns.capture.pose_checks import as_matrix, correct_poses
 from bitymi_ns.capture.recognise import SPLITS
 from bitymi_ns.capture.splits import NameLists
 from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say
@@ -145,7 +145,6 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
         _check_applied(path, meta)
         _check_lists(path, meta)
         correct_poses(path, meta["frames"])
-        check_repeated(path, meta["frames"])
     return meta
 
 

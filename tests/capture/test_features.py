@@ -7,7 +7,7 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture.sfm import features
+from bitymi_ns.capture.sfm import pairs
 from bitymi_ns.capture.sfm.job import CameraGroup, Job
 from bitymi_ns.capture.types import ColmapCamera
 
@@ -28,7 +28,7 @@ def test_a_run_that_was_killed_between_its_cameras_goes_on(job: Job, tmp_path: P
     with pycolmap.Database.open(database) as opened:
         opened.write_camera(job.cameras[0].camera.colmap)
     for _ in range(2):
-        features.extract(job, database, lambda *told, **more: None)
+        pairs.extract(job, database, lambda *told, **more: None)
     with pycolmap.Database.open(database) as opened:
         assert [camera.params[0] for camera in opened.read_all_cameras()] == [90.0, 91.0]
         images = opened.read_all_images()

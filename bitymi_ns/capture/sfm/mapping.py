@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.sfm import explain, features, pairs
+from bitymi_ns.capture.sfm import explain, pairs
 from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
 from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
 from bitymi_ns.capture.types import CONTRADICTED
@@ -144,7 +144,7 @@ def _filter(model: pycolmap.Reconstruction, pixel: float) -> None:
 def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
     """Triangulate points with a job's known poses. Raises NoPoses: hardly any, so the poses may be wrong."""
     database = Path(job.work) / DATABASE
-    features.extract(job, database, tell)
+    pairs.extract(job, database, tell)
     pairs.match(job, database, tell)
     tell("triangulating", 0, 1)
     model = _known(job, database)

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap  # in this process with its signal handlers, which write the stack of a crash to the log
 
 from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.sfm import consistency, explain, features, mapping, pairs
+from bitymi_ns.capture.sfm import consistency, explain, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder, write_errors_as
 
@@ -47,7 +47,7 @@ def send(**line: object) -> None:
 def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, object]]:
     """Find poses of a job's photographs; return the model and statistics. Raises NoPoses: there are none."""
     database = Path(job.work) / DATABASE
-    features.extract(job, database, stages)
+    pairs.extract(job, database, stages)
     pairs.match(job, database, stages)
     graph, model = _mapped(job, database, stages)
     registered = model.num_reg_images() if model is not None else 0

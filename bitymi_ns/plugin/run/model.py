@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -14,7 +15,6 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch import Tensor
 from torch.nn import Parameter
 
-from bitymi_ns.capture.points import reporting_time
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
 from bitymi_ns.plugin.console import fail, say, warn
@@ -195,6 +195,7 @@ class BitymiModel(SurfelModel):
         return super().load_state_dict(state_dict, strict=True)
 
 
+MANY_POINTS = 500_000  # points from which on surfels take long enough to say so
 FEW_POINTS = 50  # points below which much of a scene may have none near it
 
 
@@ -226,10 +227,14 @@ def new_scene(
             advice = "Make the cloud again, or remove ply_file_path from transforms.json to start from random points."
             fail(f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. {advice}")
         box = None if scene_box is None else _corners(scene_box)
-    with reporting_time("Making surfels of", len(xyz)):
-        background = find_background() if find_background and train.background_points else None
-        bounded = metadata.get("has_alpha", False)
-        scene, report = build_scene(xyz, rgb, centers, config, train, bounded, pixels, box, declared, background)
+    many, started = len(xyz) >= MANY_POINTS, time.perf_counter()
+    if many:
+        say(f"Making surfels of {len(xyz):,} points. This may take minutes.")
+    background = find_background() if find_background and train.background_points else None
+    bounded = metadata.get("has_alpha", False)
+    scene, report = build_scene(xyz, rgb, centers, config, train, bounded, pixels, box, declared, background)
+    if many:
+        say(f"Making surfels took {time.perf_counter() - started:.1f} s.")
     for sentence in messages.warnings_at_start(report, train, pixels, config):
         say(sentence)
     if report.random:

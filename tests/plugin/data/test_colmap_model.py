@@ -30,9 +30,10 @@ def test_byte_order_marks(project: Path, encoding: str) -> None:
 
 def test_3dgs_list_of_held_out_views(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = project / "sparse/0/test.txt"
-    path.write_text("frame_00004.png\nframe_00007\n")
+    path.write_text("frame_00004.png\nframe_00007\nframe_00099.png\n")
     assert held_out(load_any(project)) == ["frame_00004.png", "frame_00007.png"]
-    assert f"2 of 12 photographs, by {path} (frame_00004.png, frame_00007.png)" in printed(capsys)
+    assert f"2 of 12 photographs, by {path} (frame_00004.png, frame_00007.png)" in (text := printed(capsys))
+    assert f"{path}: 1 of 3 names are of no photograph of the capture." in text
     (project / "test_list.txt").write_text("frame_00001.png\n")
     assert held_out(load_any(project)) == ["frame_00001.png"]
 

@@ -45,7 +45,7 @@ BANNED = {
     r"\bsurfels? (?:that )?speaks?\b|\bspeak to them\b": "affect",
     r"\bwhat a run's own\b|(?<!-)\bthinned\b": "limits; sampled",
     r"\blot of surfels\b|\bhouse word": "surfels",
-    r"\b(?:through_pixel|kPacks?|list_places)\b|\bPack<": "prefilter; blocks; ids; Lanes",
+    r"\b(?:through_pixel|kPacks?|list_places)\b|\bPack<": "blocks; ids; Lanes",
 }
 """Pattern: replacement."""
 QUESTION = re.compile(r"(?:What|Whether|How|Where|Who|Which|When)\b")

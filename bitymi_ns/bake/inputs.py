@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.ops import Prefilter, TexelAlpha
+from bitymi_ns.ops import TexelAlpha
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import Visibility, visibility
@@ -23,10 +23,9 @@ class BakeInput:
 
     surfels: Mapping[str, Tensor]  # per-surfel parameters by name, N rows, float32
     cameras: Sequence[Camera]  # training views; there may be none
-    # near, weight_bound, prefilter: as the scene is drawn
+    # near, weight_bound: as the scene is drawn
     near: float
     weight_bound: float
-    prefilter: Prefilter
     views: Visibility | None = None  # visibility in the cameras; None = not computed
     alpha: TexelAlpha | None = None  # opacities of the texels; None = opaque texels
 
@@ -46,8 +45,8 @@ class BakeInput:
         """Add the visibility, where there are cameras and the options need it."""
         if not self.cameras or not (options.drop_unseen or options.tolerance > 0):
             return self
-        drawn = (self.near, self.weight_bound, self.prefilter)
-        return replace(self, views=visibility(self.surfels, self.cameras, *drawn, progress, self.alpha))
+        seen = visibility(self.surfels, self.cameras, self.near, self.weight_bound, progress, self.alpha)
+        return replace(self, views=seen)
 
 
 def device_of(cameras: Sequence[Camera]) -> torch.device:

@@ -53,7 +53,7 @@ def drop_unseen(
     rows, gone = drawable(scene.surfels)
     surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
     alpha = None if baked.alpha is None else baked.alpha.of(rows).to(device)
-    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, scene.prefilter, alpha=alpha)
+    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, alpha=alpha)
     inputs = inputs.with_visibility(baked.options, progress)
     if inputs.views is not None and baked.options.drop_unseen:
         seen = inputs.views.transmittance > 0

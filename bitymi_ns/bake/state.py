@@ -36,7 +36,7 @@ class BakeableScene(Protocol):
     surfels: Mapping[str, Tensor]
     field: Any  # a residual field, a `TexelField`, or None
     near: float
-    config: Any  # weight_bound, prefilter
+    config: Any  # weight_bound
 
 
 @dataclass
@@ -81,7 +81,6 @@ class BakeState:
             torch.zeros(0, 5, dtype=torch.int32),
             near=scene.near,
             weight_bound=scene.config.weight_bound,
-            prefilter=scene.config.prefilter,
         )
         return cls(baked, rows.cpu(), pack(()), tiles.texels, None, options).with_tiles(tiles)
 

@@ -56,7 +56,7 @@ class TexelList:
     def projection(self, camera: Camera) -> Projection:
         """Project the surfels into a view."""
         geometry = (self.scene.surfels[name] for name in GEOMETRY)
-        return project(*geometry, camera.to(self.device), self.scene.near, self.scene.prefilter, alpha=self.alpha)
+        return project(*geometry, camera.to(self.device), self.scene.near, alpha=self.alpha)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress) -> Tensor:
         """Measure every texel's coverage in unmasked pixels: [T, 2], the sums over views and fragments of the blending

@@ -43,8 +43,7 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
     means, render = bundle.scene.surfels["means"], bundle.info.render
     seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
     if cameras:
-        drawn = {"prefilter": bundle.scene.prefilter, "alpha": texel_alpha(bundle.scene)}
-        views = visibility(trained, cameras, render.near, **drawn)
+        views = visibility(trained, cameras, render.near, alpha=texel_alpha(bundle.scene))
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
     at = (means, seen, centers_of(cameras, means), opacity)

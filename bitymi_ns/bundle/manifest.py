@@ -231,7 +231,7 @@ class RenderEntry(Part):
     near: Annotated[float, Field(ge=1e-9, le=1e6)]
     weight_bound: Share
     low_pass: _only(1.0) = 1.0  # type: ignore[valid-type]
-    prefilter: Literal["low_pass", "pixel"] = "low_pass"
+    prefilter: Literal["low_pass"] | None = None  # which earlier versions state
     photographed: Annotated[str, AfterValidator(_points)] | None = None
     """Points of the scene with the pixels per unit of length of their photographs (`points_text`): since versions 1.4
     and 2.3."""

@@ -234,7 +234,6 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
         view_color=info.surfels.view_color,
         near=render.near,
         weight_bound=render.weight_bound,
-        prefilter=render.prefilter,
         photographed=None if points is None else points_of(points),
         **contents(folder, info, files, decode),
     )

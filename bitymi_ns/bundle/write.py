@@ -167,7 +167,6 @@ def _describe(
         "render": {
             "near": scene.near,
             "weight_bound": scene.weight_bound,
-            "prefilter": scene.prefilter,
             "photographed": None if scene.photographed is None else points_text(scene.photographed),
             "background": list(background),
         },

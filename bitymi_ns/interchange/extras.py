@@ -200,7 +200,7 @@ def summary_line(written: ExtraFile) -> str:
 
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
     chosen = [camera.within(SEEN_SIDE) for camera in cameras]
-    drawn = (scene.near, scene.weight_bound, scene.prefilter, progress, texel_alpha(scene))
+    drawn = (scene.near, scene.weight_bound, progress, texel_alpha(scene))
     seen = visibility(scene.surfels, chosen, *drawn).seen
     return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
 

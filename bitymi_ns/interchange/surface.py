@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
-from bitymi_ns.ops import Prefilter, TexelAlpha, fitting_lists, project
+from bitymi_ns.ops import TexelAlpha, fitting_lists, project
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import check_ranges
@@ -60,7 +60,6 @@ def median_depth(
     surfels: Mapping[str, Tensor],
     camera: Camera,
     near: float,
-    prefilter: Prefilter = "low_pass",
     alpha: TexelAlpha | None = None,
 ) -> Tensor:
     """Compute the median depth of each pixel, at which the accumulated blending weight reaches 0.5.
@@ -68,7 +67,6 @@ def median_depth(
     Args:
         surfels: geometry by name (`GEOMETRY`), of N surfels.
         near: near plane, camera z.
-        prefilter: as in `ops.project`.
         alpha: opacities of the surfels' texels; None: opaque texels.
 
     Returns:
@@ -77,7 +75,7 @@ def median_depth(
     Raises:
         TooManyFragments: a single row of screen tiles has more fragments than memory holds.
     """
-    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, prefilter, alpha=alpha)
+    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, alpha=alpha)
     rows = []
     for fragments in fitting_lists(projection):
         order = fragments.pixel.argsort(stable=True)  # keeps the front-to-back order within each pixel
@@ -127,7 +125,6 @@ def extract_surface(
     cameras: Sequence[Camera],
     near: float,
     options: SurfaceOptions | None = None,
-    prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
     alpha: TexelAlpha | None = None,
     to: Similarity | None = None,
@@ -138,7 +135,6 @@ def extract_surface(
         surfels: geometry by name (`GEOMETRY`).
         render: renders the colors [H, W, 3] of a view, for the vertices.
         near: near plane, camera z.
-        prefilter: as in `ops.project`.
         alpha: as in `median_depth`.
         to: transform to the mesh's frame; None: the scene's frame.
 
@@ -154,7 +150,7 @@ def extract_surface(
         small = [camera.within(BOX_SIDE) for camera in cameras]
         depths = []
         for i, camera in enumerate(small):
-            depths.append(median_depth(surfels, camera, near, prefilter, alpha).cpu())
+            depths.append(median_depth(surfels, camera, near, alpha).cpu())
             progress("finding the box", i + 1, len(small))
         box = observed_box(depths, small)
         voxel = float((box[1] - box[0]).max()) / options.resolution
@@ -165,7 +161,7 @@ def extract_surface(
             inside = _cut(depths[i], small[i], box)
             far = inside[inside > 0].quantile(FAR).item() if inside.any() else 0.0
             camera = _coarsened(camera, PIXELS_PER_VOXEL * far / voxel)
-            depth = _cut(median_depth(surfels, camera, near, prefilter, alpha).cpu(), camera, box)
+            depth = _cut(median_depth(surfels, camera, near, alpha).cpu(), camera, box)
             if bool((depth[::SAMPLED, ::SAMPLED] > 0).any()):
                 _integrate(volume, camera, depth, render(camera))
             progress("fusing depth maps", i + 1, len(cameras))

@@ -9,7 +9,7 @@ from .blend import blended_image, composite, soft_overdraw
 from .capacity import TooManyFragments
 from .coverage import add_texel_coverage, surfel_coverage
 from .field import FieldGeometry, field, fragment_residual
-from .project import Prefilter, Projection, project
+from .project import Projection, project
 from .rasterize_cuda import Marks, can_rasterize, rasterize_image
 from .ssim import ssim
 from .texel import TexelAlpha, TexelDescent, TexelTiles
@@ -23,7 +23,6 @@ __all__ = [
     "FieldGeometry",
     "Fragments",
     "Marks",
-    "Prefilter",
     "Projection",
     "TexelAlpha",
     "TexelDescent",

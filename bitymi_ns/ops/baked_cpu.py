@@ -63,7 +63,7 @@ def frame(
     atlas, tiles, p = scene.atlas, scene.tiles, scene.surfels
     if atlas is None and scene.blocks is not None:
         raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
-    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, scene.prefilter, photo_pixel)
+    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, photo_pixel)
     geom = projection.geom
     texture = residual(scene)
     if atlas is not None and atlas.dtype == torch.uint8:

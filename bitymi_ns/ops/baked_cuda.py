@@ -187,7 +187,6 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
             kind=scene.view_color,
             tiles=scene.tiles.contiguous(),
             near=scene.near,
-            prefilter=scene.prefilter,
         )
 
 

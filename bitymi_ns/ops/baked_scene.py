@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from .backend import Pool, version_of
-from .project import CameraLike, Prefilter, refuse_skew
+from .project import CameraLike, refuse_skew
 
 IMAGES: dict[str, tuple[int, torch.dtype]] = {
     "rgb": (3, torch.float32),
@@ -85,7 +85,6 @@ class BakedSceneLike(Protocol):
     near: float
     weight_bound: float
     transmittance_min: float
-    prefilter: Prefilter
     through_webgpu: bool
     cache: DrawCache
 

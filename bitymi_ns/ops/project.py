@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -12,8 +12,6 @@ from torch import Tensor
 from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
 from .texel import TexelAlpha
-
-Prefilter = Literal["low_pass", "pixel"]  # treatment of surfels smaller than a pixel, see `project`
 
 
 class CameraLike(Protocol):
@@ -48,7 +46,6 @@ class Projection:
         radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0: not visible.
         camera: the camera.
         near: nearest depth that is drawn, camera z.
-        prefilter: as in `project`; every kernel that reads the rows needs it.
         photo_pixel: side of a photograph's pixel in pixels of the view; if not 1, only the baked renderer can use it.
         broken: [1] int32, number of surfels dropped because a parameter is NaN or infinite.
         mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
@@ -62,7 +59,6 @@ class Projection:
     radii: Tensor
     camera: CameraLike
     near: float
-    prefilter: Prefilter
     broken: Tensor
     photo_pixel: float = 1.0
     mean2d_grad: Tensor | None = None
@@ -87,7 +83,7 @@ class Projection:
             geom: `self.geom`, detached.
         """
         size = {"width": self.camera.width, "height": self.camera.height}
-        drawn = {"near": self.near, "prefilter": self.prefilter, "photo_pixel": self.photo_pixel}
+        drawn = {"near": self.near, "photo_pixel": self.photo_pixel}
         return dict(geom=geom, radii=self.radii, **size, **drawn)
 
     @property
@@ -112,14 +108,13 @@ GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 
 class _Project(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, camera, near, prefilter, photo_pixel, viewmat, *geometry):
+    def forward(ctx, camera, near, photo_pixel, viewmat, *geometry):
         means = geometry[0]
         inputs = {name: dense(t, means) for name, t in zip(GEOMETRY, geometry, strict=True)}
         inputs |= {"viewmat": dense(viewmat, means), "K": dense(camera.K, means)}
         geom, frames, radii = (means.new_empty(len(means), k) for k in (GEOM, FRAME, 2))
         broken = torch.zeros(1, dtype=torch.int32, device=means.device)
-        view = {"width": camera.width, "height": camera.height, "near": near, "prefilter": prefilter}
-        view["photo_pixel"] = photo_pixel
+        view = {"width": camera.width, "height": camera.height, "near": near, "photo_pixel": photo_pixel}
         kernel("project_forward", means)(**inputs, **view, geom=geom, frames=frames, radii=radii, broken=broken)
         ctx.names = tuple(inputs)
         ctx.save_for_backward(*inputs.values(), geom)
@@ -145,11 +140,11 @@ class _Project(torch.autograd.Function):
             return out
 
         out, dviewmat = gradients(dframes), None
-        if ctx.needs_input_grad[4]:
+        if ctx.needs_input_grad[3]:
             named = dict(zip(ctx.names, inputs, strict=True))
             dmeans, dquats = (out if dframes is None else gradients(None))[:2]  # frames are those of the world
             dviewmat = rigid_gradient(named["means"], named["quats"], dmeans, dquats, named["viewmat"])
-        return None, None, None, None, dviewmat, *out
+        return None, None, None, dviewmat, *out
 
 
 def rigid_gradient(means: Tensor, quats: Tensor, dmeans: Tensor, dquats: Tensor, viewmat: Tensor) -> Tensor:
@@ -213,7 +208,6 @@ def project(
     beta_raw: Tensor,
     camera: CameraLike,
     near: float = 0.2,
-    prefilter: Prefilter = "low_pass",
     photo_pixel: float = 1.0,
     alpha: TexelAlpha | None = None,
 ) -> Projection:
@@ -227,11 +221,9 @@ def project(
         beta_raw: [N], beta = 4 sigmoid (eq. beta-kernel).
         camera: OpenCV axes; its `viewmat` may require a gradient (along rigid motions).
         near: surfels with a centre nearer than this (camera z) are dropped.
-        prefilter: low_pass = the maximum of the kernel and a low pass; pixel = the kernel averaged over a pixel
-            (csrc/core/prefilter.h), with n = fx fy s_u s_v / z^2 in the last column of geom.
         photo_pixel: side of a photograph's pixel in pixels of the view (csrc/core/resize.h); if not 1, for the baked
-            renderer on the CPU only, without gradients, and without effect on the prefilter `pixel`. The last column of
-            geom is then the height of the low pass over that of the kernel.
+            renderer on the CPU only and without gradients. The last column of geom is then the height of the low pass
+            over that of the kernel.
         alpha: alpha texels; None: opaque.
 
     Raises:
@@ -241,5 +233,5 @@ def project(
     if photo_pixel != 1.0 and (cuda_backend(means.device) or (torch.is_grad_enabled() and means.requires_grad)):
         raise ValueError("surfels are resized on the CPU and without gradients alone")
     geometry = checked_geometry(means, quats, log_scales, opacity_logits, beta_raw, camera)
-    geom, frames, radii, broken = _Project.apply(camera, near, prefilter, photo_pixel, camera.viewmat, *geometry)
-    return Projection(geom, frames, radii, camera, near, prefilter, broken, photo_pixel, alpha=alpha)
+    geom, frames, radii, broken = _Project.apply(camera, near, photo_pixel, camera.viewmat, *geometry)
+    return Projection(geom, frames, radii, camera, near, broken, photo_pixel, alpha=alpha)

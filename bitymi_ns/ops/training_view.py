@@ -15,7 +15,7 @@ from .bin_cuda import check_pair_count
 from .blend import checked_texels
 from .constants import FRAME, GEOM
 from .picture_cuda import PhotographTarget
-from .project import GEOMETRY, CameraLike, Prefilter, Projection, checked_geometry, rigid_gradient
+from .project import GEOMETRY, CameraLike, Projection, checked_geometry, rigid_gradient
 from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
 from .view_color import check_view_color, lettered
 from .view_kinds import entry_of
@@ -43,7 +43,6 @@ class _Drawing:
     photograph: PhotographTarget
     kind: str
     near: float
-    prefilter: Prefilter
     rim: float
     tiles: TexelTiles
     bound: float
@@ -79,7 +78,6 @@ class _TrainingView(torch.autograd.Function):
             rim=drawing.rim,
             bound=drawing.bound,
             moves=int(drawing.moves),
-            prefilter=drawing.prefilter,
             kind=drawing.kind,
             terms=entry.terms(dict(zip(entry.names, colors, strict=True))),
             geom=geom,
@@ -99,7 +97,7 @@ class _TrainingView(torch.autograd.Function):
         ctx.drawn["pair_memory"] = torch.empty(needed, dtype=torch.uint8, device=device)
         kernel("draw_view", means)(**ctx.drawn)
         ctx.save_for_backward(viewmat, correction, texels, alpha, *inputs.values(), *colors)
-        drawing.projection = Projection(geom, frames, radii, camera, drawing.near, drawing.prefilter, broken)
+        drawing.projection = Projection(geom, frames, radii, camera, drawing.near, broken)
         ctx.drawing = drawing
         return photometric, falloff
 
@@ -153,7 +151,6 @@ def training_view(
     descent: TexelDescent | None = None,
     alpha: TexelAlpha | None = None,
     near: float = 0.2,
-    prefilter: Prefilter = "low_pass",
     rim: float = 1e-3,
 ) -> ComparedView:
     """Draw a view over the photograph's background, correct its exposure, and compute the losses.
@@ -169,7 +166,7 @@ def training_view(
         correction: of the photograph, [3] or [3, 4], see `train.views.View`; None: none.
         texels, tiles, bound, move_surfels, descent: as in `blended_image`.
         alpha: alpha texels, of the same tiles; None: opaque.
-        camera, near, prefilter: as in `project`.
+        camera, near: as in `project`.
         rim: as in `trace`.
 
     Raises:
@@ -187,7 +184,7 @@ def training_view(
     surfel_inputs = (*geometry, *entry_of(kind).of(surfels))
     if descent is not None and not means.requires_grad:
         surfel_inputs = (means.detach().requires_grad_(), *surfel_inputs[1:])  # see `rasterize_image`
-    drawing = _Drawing(camera, photograph, kind, near, prefilter, rim, tiles, bound, moves, descent)
+    drawing = _Drawing(camera, photograph, kind, near, rim, tiles, bound, moves, descent)
     values = None if alpha is None else alpha.values
     losses = _TrainingView.apply(
         drawing, camera.viewmat, camera.exact_center, correction, texels, values, *surfel_inputs

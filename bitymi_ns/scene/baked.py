@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Prefilter
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.baked import DrawCache, common_size, draw, packed
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
@@ -65,7 +64,6 @@ class BakedScene:
         mean_alpha: [N] float32 mean m of each tile, and m of surfels without a tile. None: 1.
         near: near plane, camera z.
         weight_bound: fragments of smaller blending weight have no residual.
-        prefilter: low_pass or pixel, as in `SceneConfig`.
         transmittance_min: a pixel ends at the surfel, not blended itself, that would leave less transmittance; 0: no
             limit. Training uses 1e-4; `FAST` is faster and changes a pixel by at most half an 8-bit step. WebGPU always
             uses 1e-4.
@@ -86,7 +84,6 @@ class BakedScene:
     mean_alpha: Tensor | None = None
     near: float = 0.2
     weight_bound: float = 0.0
-    prefilter: Prefilter = "low_pass"
     transmittance_min: float = TRANSMITTANCE_MIN
     blocks: Tensor | None = None
     photographed: Tensor | None = None

@@ -5,7 +5,6 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from bitymi_ns.ops import Prefilter
 from bitymi_ns.ops.constants import MAX_LEVELS, MAX_TERMS
 from bitymi_ns.ops.view_kinds import Kind
 from bitymi_ns.ranges import Count, Share
@@ -43,9 +42,6 @@ class SceneConfig:
     """Blending weight below which fragments have no residual colour; 0 to 1."""
     texture_moves_surfels: bool = False
     """Let the gradient of the residual field with respect to position reach the surfels; that of texels always does."""
-    prefilter: Prefilter = "low_pass"
-    """Antialiasing of small discs: low_pass = at least a blob of fixed size in pixels around the centre; pixel = the
-    kernel averaged over the pixel, with the right moments (docs/numerics.md)."""
     max_fragments: Count = 0
     """Maximum number of fragments in memory. Views with more are rendered in bands, which the backward pass renders
     again. 0: on a GPU as many as its memory holds, on the CPU 2^25, which take 1.5 GB."""

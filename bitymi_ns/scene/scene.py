@@ -176,7 +176,7 @@ class Scene(nn.Module):
             TooManyFragments: a single row of screen tiles has too many.
         """
         p = self.surfels
-        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, self.config.prefilter)
+        projection = project(*(p[name] for name in GEOMETRY), camera, self.near)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
         texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode)
@@ -229,5 +229,5 @@ class Scene(nn.Module):
         if texture is None:
             return None
         alpha = None if self.field is None else self.field.opacity(self.config.weight_bound, field_mode == "train")
-        view = {"near": self.near, "prefilter": self.config.prefilter, "rim": self.config.rim, "alpha": alpha}
+        view = {"near": self.near, "rim": self.config.rim, "alpha": alpha}
         return training_view(self.config.view_color, self.surfels, camera, photograph, correction, **texture, **view)

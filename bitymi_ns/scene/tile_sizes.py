@@ -182,7 +182,7 @@ def visible_extent(opacity: Tensor, beta: Tensor, weight_bound: float) -> Tensor
     """Compute the radius [N], in scale units, at which opacity * (1 - r^2 / 9)^beta falls to the weight bound; 0 if all
     is below.
 
-    The prefilter spreads a surfel about a pixel beyond it; there the tile's edge is read.
+    The low pass spreads a surfel about a pixel beyond it; there the tile's edge is read.
     """
     rest = (weight_bound / opacity.clamp(min=1e-12)).clamp(max=1.0) ** (1.0 / beta.clamp(min=1e-6))
     return SUPPORT * (1.0 - rest).clamp(min=0.0).sqrt()

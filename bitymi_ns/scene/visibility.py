@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Prefilter, TexelAlpha, project, surfel_coverage
+from bitymi_ns.ops import TexelAlpha, project, surfel_coverage
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
@@ -58,7 +58,6 @@ def visibility(
     cameras: Sequence[Camera],
     near: float,
     weight_bound: float = 0.0,
-    prefilter: Prefilter = "low_pass",
     progress: Progress = no_progress,
     alpha: TexelAlpha | None = None,
 ) -> Visibility:
@@ -68,7 +67,6 @@ def visibility(
         surfels: the per-surfel parameters of docs/overview.md, N rows, all finite.
         near: near plane.
         weight_bound: fragments of smaller weight get no residual.
-        prefilter: as in `ops.project`.
         alpha: opacities of the surfels' texels; None: opaque texels.
     """
     means = surfels["means"]
@@ -76,7 +74,7 @@ def visibility(
     largest, pixels = means.new_zeros(2, len(means))
     squares = torch.zeros(len(cameras), len(means), dtype=torch.bfloat16, device=means.device)
     for done, camera in enumerate(cameras, start=1):
-        projection = project(means, *geometry, camera.to(means.device), near, prefilter, alpha=alpha)
+        projection = project(means, *geometry, camera.to(means.device), near, alpha=alpha)
         shown = surfel_coverage(projection, weight_bound)
         largest, pixels = torch.maximum(largest, shown[:, 0]), torch.maximum(pixels, shown[:, 1])
         squares[done - 1] = shown[:, 2]

@@ -150,7 +150,7 @@ def blank_texels(
     bound = scene.config.weight_bound
     scale = 0.5 if mean_pixels(cameras) >= 4 * SURVEY_PIXELS else 1.0
     smaller = [camera.scaled(scale) for camera in cameras]
-    seen = visibility(surfels, smaller, scene.near, bound, scene.config.prefilter)
+    seen = visibility(surfels, smaller, scene.near, bound)
     seen = replace(seen, pixels=seen.pixels / scale**2)
     size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options, to_come)
     field = TexelField(size, extent, extent.new_zeros(int(size.long().prod(1).sum()), 3))
@@ -239,6 +239,6 @@ def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
         camera = view.camera.to(covered.device)
-        projection = project(*geometry, camera, scene.near, scene.config.prefilter)
+        projection = project(*geometry, camera, scene.near)
         add_texel_coverage(projection, field.tiles, view.mask, scene.config.weight_bound, covered)
     return covered[:, 0]

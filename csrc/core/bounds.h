@@ -8,7 +8,6 @@
 #pragma once
 
 #include "core/outline.h"
-#include "core/prefilter.h"
 
 namespace bt {
 
@@ -30,37 +29,7 @@ template <class T> BT_HD void find_outermost(ExtentOf<T>& e) {
   e.y_left = -(e.qb * e.x0 + e.qe) / e.qc, e.y_right = -(e.qb * e.x1 + e.qe) / e.qc;
 }
 
-// Bounds the prefiltered level set by the ellipse q <= r_c^2 of the largest blur and magnification at any pixel: omega
-// <= 1 / (1 - eta), eta = the relative reach of the support in depth.
-BT_HD Extent filtered_extent(const double* g) {
-  using S = double;
-  Extent e;
-  const S n = g[kArea], w0 = g[kW0], c = filter_variance(g[kBeta]);
-  if (!(w0 > S(0)) || !(times_drawn(g[kOpacity]) > S(1))) return e;  // exactly edge-on: nothing to see
-  const S e1 = g[kW1] * g[kV2] - g[kW2] * g[kV1], e2 = g[kU1] * g[kW2] - g[kU2] * g[kW1];
-  const S eta = S(kSupport) * sqrt_(e1 * e1 + e2 * e2) * n / w0 * S(1.0001);
-  e.whole = !(eta < S(0.9));
-  e.visible = true;
-  if (e.whole) return e;
-  const S w = S(1) / (S(1) - eta), w2 = w * w * n * n;
-  const S xx = w2 * (g[kU2] * g[kU2] + g[kV2] * g[kV2]) + c, yy = w2 * (g[kU1] * g[kU1] + g[kV1] * g[kV1]) + c;
-  const S xy = -w2 * (g[kU1] * g[kU2] + g[kV1] * g[kV2]), area = w * w * n * w0;
-  // the determinant without cancellation, at least the rounding error of its coefficients
-  const S det = max_(area * area + c * (xx + yy - c), S(1e-12) * xx * yy);
-  const S level = log_(times_drawn(g[kOpacity]) * area / sqrt_(det)) + S(1e-4);
-  e.visible = level >= S(0);
-  if (!e.visible) return e;
-  const S rc2 = level_radius2(level, g[kBeta], S(1e-6));
-  e.qa = yy / det, e.qb = -xy / det, e.qc = xx / det, e.qd = e.qe = S(0), e.qf = -rc2;
-  const S hx = sqrt_(rc2 * xx) * S(1.0001) + S(kBoundPad), hy = sqrt_(rc2 * yy) * S(1.0001) + S(kBoundPad);
-  e.ellipse = true;
-  e.x0 = -hx, e.x1 = hx, e.y0 = -hy, e.y1 = hy;
-  find_outermost(e);
-  e.thin = !(e.qa * e.qc - e.qb * e.qb > S(1e-10) * e.qa * e.qc);
-  return e;
-}
-
-// Level set of a row without prefilter. `room`: margin of its logarithm, 0 for doubles.
+// Level set of a row. `room`: margin of its logarithm, 0 for doubles.
 constexpr double kFloatRoom = 1e-5;
 template <class T> struct Level {
   MaskOf<T> visible;
@@ -108,7 +77,7 @@ template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int
   return e;
 }
 
-// Level set and conic (in doubles) of rows without prefilter, without the outermost points.
+// Level set and conic (in doubles) of rows, without the outermost points.
 template <class T> struct LevelExtent {
   Level<T> level;
   ExtentOf<Widened<T>> conic;
@@ -125,7 +94,6 @@ BT_HD LevelExtent<T> level_extent(const T* g, int width, int height, double shar
 template <class Kernel, class F> BT_HD Extent extent(const F* geom, int width, int height, double sharp = 1) {
   double g[kGeom];
   for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
-  if (filtered<Kernel>(g)) return filtered_extent(g);
   const Level<double> level = level_of<Kernel>(g, sharp, 0);
   if (!level.visible) return {};
   Extent e = conic_extent(g, level.r2, level.blur, width, height);

@@ -11,39 +11,25 @@ constexpr int kBands = 4, kBandRows = kTile / kBands;  // of a tile
 // A row of geom up to kBeta with its level set.
 enum LevelColumn {
   kR2 = kBeta + 1,  // u^2 + v^2 <= r2
-  kBlur2,  // and d^2 <= blur2; 0: no visible low pass; -kArea if PixelKernel filters the surfel. With ResizedKernel it
-           // also encodes the height of the low pass, which falls to 1/255 at blur2
+  kBlur2,  // and d^2 <= blur2; 0: no visible low pass. With ResizedKernel it also encodes the height of the low pass,
+           // which falls to 1/255 at blur2
   kLevelRow
 };
 // Fills the row; false if nothing of the surfel is visible.
 template <class Kernel, class S> BT_HD bool level_row(const S* geom, S near, S sharp, S* row) {
   for (int k = 0; k <= kBeta; ++k) row[k] = geom[k];
-  if (filtered<Kernel>(geom)) {
-    row[kR2] = S(0), row[kBlur2] = -geom[kArea];
-    return filtered_bounds(geom).visible;
-  }
   const LevelSet<S> level = level_set<Kernel>(geom, near, sharp);
   row[kR2] = level.r2, row[kBlur2] = level.blur2;
   return level.visible;
 }
-template <class Kernel, class S> BT_HD bool filtered_row(const S* row) { return Kernel::kPixel && row[kBlur2] < S(0); }
 // Bounds of the pixels that it can touch; `pad`: rounding margin of an ellipse.
 template <class S> struct RowBounds {
   PlaneBounds<S> bounds;
   S pad;
 };
-template <class Kernel, class S> BT_HD RowBounds<S> row_bounds(const S* row, int width, int height) {
-  RowBounds<S> b;
-  if (filtered_row<Kernel>(row)) {
-    S geom[kGeom];
-    for (int k = 0; k < kGeom; ++k) geom[k] = k <= kBeta ? row[k] : S(0);
-    geom[kArea] = -row[kBlur2];
-    b.bounds = filtered_bounds(geom).bounds;
-  } else {
-    b.bounds = plane_bounds(row, row[kR2], row[kBlur2], width, height);
-  }
-  b.pad = S(kBoundPad) + S(1e-6) * (abs_(row[kCx]) + abs_(row[kCy]));
-  return b;
+template <class S> BT_HD RowBounds<S> row_bounds(const S* row, int width, int height) {
+  return {plane_bounds(row, row[kR2], row[kBlur2], width, height),
+          S(kBoundPad) + S(1e-6) * (abs_(row[kCx]) + abs_(row[kCy]))};
 }
 
 template <class S> struct Footprint : RowBounds<S> {
@@ -58,9 +44,9 @@ template <class S> BT_HD int pixel_to(S x, int most) {  // last pixel centre lef
   const S i = floor_(x - S(0.5));
   return i < most - 1 ? (i >= 0 ? int(i) : -1) : most - 1;
 }
-template <class Kernel, class S> BT_HD Footprint<S> footprint(const S* row, int width, int height) {
+template <class S> BT_HD Footprint<S> footprint(const S* row, int width, int height) {
   Footprint<S> f;
-  static_cast<RowBounds<S>&>(f) = row_bounds<Kernel>(row, width, height);
+  static_cast<RowBounds<S>&>(f) = row_bounds(row, width, height);
   f.cx = row[kCx], f.cy = row[kCy];
   const PlaneBounds<S>& e = f.bounds;
   Interval<S> y;
@@ -122,9 +108,8 @@ BT_HD uint32_t part_mask(const TileRow& r, int tx) {
   return mask;
 }
 // Computes the part mask of a disc without a box that crosses the camera's plane: parts that its level set or low pass
-// reaches, or all parts with the prefilter.
-template <class Kernel, class S> BT_HD uint32_t reached_parts(const S* row, int tx, int ty) {
-  if (filtered_row<Kernel>(row)) return (1u << 2 * kBands) - 1;
+// reaches.
+template <class S> BT_HD uint32_t reached_parts(const S* row, int tx, int ty) {
   constexpr S kPartWidth = kTile / 2;
   const S x = tx * kTile - row[kCx], y = ty * kTile - row[kCy];
   const S half_x = cell_half(S(0.5) * (kPartWidth - 1), row[kCx], abs_(x) + kTile),

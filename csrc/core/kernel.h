@@ -1,13 +1,19 @@
 // Intersection of a pixel's ray with a surfel, and its coverage: the Beta kernel of eq. (beta-kernel) (Deformable Beta
 // Splatting, Liu et al. 2025) with the screen-space low pass of 2D Gaussian Splatting,
-// sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))); or PixelKernel (core/prefilter.h).
+// sigma = min(0.99, o max((1 - (u^2 + v^2)/9)+^beta, exp(-d^2))).
 #pragma once
 
 #include "core/blend.h"
-#include "core/prefilter.h"
 #include "core/resize.h"
 
 namespace bt {
+
+template <class T> struct Fragment {
+  T u, v;      // surfel coordinates in scale units; clamped to the support in the low-pass branch, 0 without a hit
+  T depth;     // camera z of the hit; of the centre in the low-pass branch
+  T sigma;     // effective opacity
+  T low_pass;  // 1 in the low-pass branch, else 0
+};
 
 // Returns true where the low pass may be drawn.
 template <class T> BT_HD MaskOf<T> near_centre(T dx, T dy) {
@@ -85,7 +91,6 @@ template <bool kMisses = true, class S, class T> BT_HD Hit<T> hit(const S* g, S 
 template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   const T zero = T(S(0)), one = T(S(1));
-  if (filtered<Kernel>(g)) return filtered_fragment<S, T>(g, near, filtered_hit<S, T>(g, dx, dy));
   const Hit<T> h = hit<kBlur>(g, near, dx, dy);
   const T kernel = select(h.ok & (h.rest > zero), power_(max_(h.rest, T(S(1e-30))), T(g[kBeta])), zero);
   Fragment<T> f;
@@ -132,10 +137,9 @@ template <class T> BT_HD T listed_sigma(const Fragment<T>& f) {
 // Adds the gradients of a row of geom to d[kGeom], from those of a fragment with sigma `listed`; ddx, ddy is the
 // gradient with respect to the pixel's offset. `rim` bounds 1 - x from below in the kernel's derivative, which diverges
 // at the rim for beta < 1.
-template <class Kernel, class S, class T>
+template <class S, class T>
 BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T listed, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
                         T& ddy) {
-  if (filtered<Kernel>(g)) return filtered_vjp<S, T>(g, near, rim, dx, dy, dsigma, du, dv, ddepth, d, ddx, ddy);
   const T zero = T(S(0)), two = T(S(2));
   const Hit<T> h = hit(g, near, dx, dy);
   const T u = h.u, v = h.v, inv = h.inv, rest = h.rest, q = T(g[kW0] * g[kZ]);

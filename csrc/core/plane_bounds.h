@@ -63,27 +63,6 @@ template <class S> BT_HD PlaneBounds<S> plane_bounds(const S* g, S r2, S blur2, 
   return e;
 }
 
-// Prefiltered bounds: the ellipse of bounds.h, without perspective. Rare, so evaluated in double.
-template <class S> struct FilteredBounds {
-  bool visible;
-  PlaneBounds<S> bounds;
-};
-template <class S> BT_HD FilteredBounds<S> filtered_bounds(const S* geom) {
-  double g[kGeom];
-  for (int i = 0; i < kGeom; ++i) g[i] = double(geom[i]);
-  const Extent x = filtered_extent(g);
-  FilteredBounds<S> f = {};
-  f.visible = x.visible;
-  PlaneBounds<S>& e = f.bounds;
-  e.whole = x.visible && x.whole, e.ellipse = x.visible;
-  if (!x.visible || x.whole) return f;
-  // d^T Q d <= r^2 is the disc's image under r L with L L^T = Q^-1
-  const double r2 = -x.qf * 1.0003, inv = r2 / (x.qa * x.qc - x.qb * x.qb), top = x.qc * inv;
-  e.xu = S(sqrt_(top)), e.yu = S(-x.qb * inv / sqrt_(top)), e.yv = S(sqrt_(r2 / x.qc));
-  bounding_box(e);
-  return f;
-}
-
 // Adds the crossings of the line y with the ellipse.
 template <class S> BT_HD void add_crossings(const PlaneBounds<S>& e, S y, Interval<S>& r) {
   const S mu = e.yu - y * e.cu, mv = e.yv - y * e.cv, mm = mu * mu + mv * mv;

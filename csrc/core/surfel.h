@@ -25,39 +25,22 @@ constexpr double kLogScaleMax = 30.0;  // log scales are clamped to +-30: their 
 
 // Columns of a row of `geom` [N, kGeom].
 enum GeomColumn { kCx, kCy, kU1, kU2, kV1, kV2, kW0, kW1, kW2, kZ, kOpacity, kBeta, kNx, kNy, kNz, kGeom = 16 };
-// Last column by kernel. PixelKernel: n = fx fy s_u s_v / z^2, so that n w0 is the area of the projected scale ellipse
-// over pi; 0 if the surfel is not filtered. ResizedKernel: height of the low pass over that of the kernel
-// (core/resize.h). LowPassKernel: 0.
-constexpr GeomColumn kArea = GeomColumn(kGeom - 1), kLowPassHeight = kArea;
+// Last column: ResizedKernel's height of the low pass over that of the kernel (core/resize.h); LowPassKernel: 0.
+constexpr GeomColumn kLowPassHeight = GeomColumn(kGeom - 1);
 // Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
 constexpr int kFrame = 9;
 
-// Values of the option `prefilter`, by index.
-constexpr const char* kPrefilters[] = {"low_pass", "pixel"};
 // Kernels, chosen at compile time by with_kernel. LowPassKernel: the maximum of the Beta kernel and the low pass
-// (core/kernel.h). PixelKernel: the prefilter of core/prefilter.h; rows with kArea 0 are drawn as by LowPassKernel.
-// ResizedKernel: LowPassKernel in a view of another size than the photographs, for the baked renderers.
+// (core/kernel.h). ResizedKernel: the same in a view of another size than the photographs, for the baked renderers.
 struct LowPassKernel {
-  static constexpr bool kPixel = false, kResized = false;
-};
-struct PixelKernel {
-  static constexpr bool kPixel = true, kResized = false;
+  static constexpr bool kResized = false;
 };
 struct ResizedKernel {
-  static constexpr bool kPixel = false, kResized = true;
+  static constexpr bool kResized = true;
 };
-template <class F> void with_kernel(int prefilter, F&& launch) {
-  prefilter ? launch(PixelKernel()) : launch(LowPassKernel());
-}
 // photo_pixel: side of a photograph's pixel in pixels of the view.
-template <class F> void with_kernel(int prefilter, float photo_pixel, F&& launch) {
-  !prefilter&& photo_pixel != 1 ? launch(ResizedKernel()) : with_kernel(prefilter, launch);
-}
-template <class Kernel, class S> BT_HD bool filtered(const S* g) {
-  if constexpr (Kernel::kPixel)
-    return g[kArea] > S(0);
-  else
-    return false;
+template <class F> void with_kernel(float photo_pixel, F&& launch) {
+  photo_pixel != 1 ? launch(ResizedKernel()) : launch(LowPassKernel());
 }
 
 // Evaluates a plane without its constant at (dx, dy) pixels from the projected centre: U is slope(g, kU1, ...), W is
@@ -180,7 +163,7 @@ template <class S, class T> BT_HD CameraSurfel<S, T> camera_surfel(const Pinhole
 
 // Fills a row of geom and of frames; false, with undefined rows, if the surfel is not finite or its centre is nearer
 // than `near` (camera z).
-template <class Kernel, class S, class T>
+template <class S, class T>
 BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T* g, T* frame) {
   const WorldSurfel<T> at = world_surfel(cam, in);
   const auto& [rot, su, sv, p] = at;
@@ -195,12 +178,7 @@ BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T
   g[kOpacity] = sigmoid(in.opacity_logit);
   g[kBeta] = T(kBetaMax) * sigmoid(in.beta_raw);
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
-  g[kArea] = T(0.0f);
-  if constexpr (Kernel::kPixel) {
-    // discs a million pixels wide need no filter, and their squared areas could overflow
-    const T area = T(cam.fx) * T(cam.fy) * su * sv * iz * iz;
-    g[kArea] = select(area < T(1e12), area, T(0.0f));
-  }
+  g[kLowPassHeight] = T(0.0f);
   MaskOf<T> ok = rot.ok & finite_(p.x) & finite_(p.y) & (p.z > T(near)) & finite_(in.log_scale[0]);
   ok = ok & finite_(in.log_scale[1]) & finite_(in.opacity_logit) & finite_(in.beta_raw);
   for (int i = 0; i < kGeom; ++i) ok = ok & finite_(g[i]);
@@ -242,16 +220,13 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, c
   dp.y += cam.fy * iz * dgeom[kCy];
   dp.z += dgeom[kZ] - iz * (dgeom[kW0] * geom[kW0] + iz * (cam.fx * p.x * dgeom[kCx] + cam.fy * p.y * dgeom[kCy]));
 
-  const S darea = dgeom[kArea] * geom[kArea];  // with respect to log n
-  dp.z -= S(2) * iz * darea;
-
   const Vec3<S> dmean = rotate_transposed(cam.R, dp) + load3(dframe);
   const Vec3<S> dtu = load3(dframe + 3), dtv = load3(dframe + 6);
   const Vec3<S> gu = rotate_transposed(cam.R, da) + su * dtu;
   const Vec3<S> gv = rotate_transposed(cam.R, db) + sv * dtv;
   // u1, u2 scale with 1/s_u and the frame with s_u
-  const S gsu = -(dgeom[kU1] * geom[kU1] + dgeom[kU2] * geom[kU2]) + su * dot(dtu, rot.tu) + darea;
-  const S gsv = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv) + darea;
+  const S gsu = -(dgeom[kU1] * geom[kU1] + dgeom[kU2] * geom[kU2]) + su * dot(dtu, rot.tu);
+  const S gsv = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv);
   const S dopacity = dgeom[kOpacity] * geom[kOpacity], dbeta = dgeom[kBeta] * geom[kBeta];
   store3(out.means + 3 * i, dmean);
   rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);

@@ -41,7 +41,7 @@ template <class Kernel, class S, class Mark>
 BT_HD bool project_visible(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, const Resize<S>& to, S* geom,
                            S* frames, S* radii, Mark&& mark) {
   Sight<S> s;
-  s.projected = project<Kernel>(cam, surfel_row(in, i), near, s.geom, s.frame);
+  s.projected = project(cam, surfel_row(in, i), near, s.geom, s.frame);
   if constexpr (Kernel::kResized) s.projected = s.projected && resize(to, s.geom);
   mark(s);
   for (int k = 0; k < kGeom; ++k) geom[i * kGeom + k] = s.seen ? s.geom[k] : S(0);

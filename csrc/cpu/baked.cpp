@@ -314,7 +314,7 @@ template <class Kernel, bool kMaps, class S> void baked_forward(const BakedForwa
 }  // namespace
 
 template <class S> void baked_forward(const BakedForward<S>& a) {
-  with_kernel(a.view.prefilter, float(a.view.photo_pixel), [&](auto kernel) {
+  with_kernel(float(a.view.photo_pixel), [&](auto kernel) {
     using Kernel = decltype(kernel);
     a.maps ? baked_forward<Kernel, true>(a) : baked_forward<Kernel, false>(a);
   });

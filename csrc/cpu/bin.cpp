@@ -20,7 +20,7 @@ template <class S> int only_tile(const S* g, const S* radii, const Bins& bins) {
   return int(row) * bins.tiles_x + int(column);
 }
 
-// Arguments of `reached` (core/kernel.h) for a row without prefilter: r_c^2, and the squared radius of the low pass, 0
+// Arguments of `reached` (core/kernel.h) for a row: r_c^2, and the squared radius of the low pass, 0
 // if the kernel covers it.
 struct ReachLevels {
   float r2, blur2;
@@ -86,13 +86,12 @@ template <class Kernel, class S> class Extents {
       __builtin_prefetch(geom_ + int64_t(order_[after].second) * kGeom);
       __builtin_prefetch(radii_ + 2 * int64_t(order_[after].second));
     }
-    if constexpr (std::is_same_v<S, float> && !Kernel::kPixel)
+    if constexpr (std::is_same_v<S, float>)
       load_lanes();
     else
       for (int lane = 0; lane < next_ - first_; ++lane) {
         const S* g = row(lane);
         found_[lane] = extent<Kernel>(g, width_, height_, sharp_);
-        if (filtered<Kernel>(g)) continue;  // has no level set
         store_levels(lane, reach_levels<Kernel>(g, near_, sharp_));
       }
   }
@@ -260,7 +259,7 @@ template <class Kernel, class S> class KernelBinner final : public Binner<S> {
       const S* g = view_.geom + id * kGeom;
       if (const int only = only_tile(g, view_.radii + 2 * id, bins_); only >= 0) {
         add(to.alone, k, only, 1);
-      } else if (e.whole && !filtered<Kernel>(g)) {
+      } else if (e.whole) {
         rows.finish(add_row);  // earlier surfels first
         for_reached_tiles(g, bins_.level.data() + 2 * id, bins_, [&](int tile) { add(to.others, k, tile, 1); });
       } else {
@@ -310,7 +309,7 @@ template <class Kernel, class S> class KernelBinner final : public Binner<S> {
 
 template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins) {
   std::unique_ptr<Binner<S>> made;
-  with_kernel(view.prefilter, float(view.photo_pixel),
+  with_kernel(float(view.photo_pixel),
               [&](auto kernel) { made = std::make_unique<KernelBinner<decltype(kernel), S>>(view, bins); });
   return made;
 }

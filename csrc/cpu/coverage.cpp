@@ -11,7 +11,7 @@ namespace {
 // Numbers in the sums of all parts but the first, at most.
 constexpr int64_t kMostSums = int64_t(1) << 28;
 
-// Calls fn(kernel, sums, tile) for every tile. Each part of the tiles has sums [rows, width] of its own; the first adds
+// Calls fn(sums, tile) for every tile. Each part of the tiles has sums [rows, width] of its own; the first adds
 // to `out`, and reduce(to, from) adds a row of the others' to it.
 template <class S, class F, class Reduce>
 void each_part(const View<S>& view, Bins& bins, S* out, int64_t rows, int64_t width, F&& fn, Reduce&& reduce) {
@@ -20,13 +20,11 @@ void each_part(const View<S>& view, Bins& bins, S* out, int64_t rows, int64_t wi
   const int64_t numbers = rows * width;
   const int most = int(std::max<int64_t>(1, std::min<int64_t>(64, kMostSums / std::max<int64_t>(numbers, 1))));
   std::vector<std::vector<S>> others(std::max(num_threads(), 1));
-  int parts = 1;
-  with_kernel(view.prefilter, [&](auto kernel) {
-    parts = parallel_tiles(bins.start.data(), bins.start.size() - 1, most, [&](int part, int64_t first, int64_t last) {
-      if (part) others[part].assign(numbers, S(0));
-      for (int64_t tile = first; tile < last; ++tile) fn(kernel, part ? others[part].data() : out, tile);
-    });
-  });
+  const int parts =
+      parallel_tiles(bins.start.data(), bins.start.size() - 1, most, [&](int part, int64_t first, int64_t last) {
+        if (part) others[part].assign(numbers, S(0));
+        for (int64_t tile = first; tile < last; ++tile) fn(part ? others[part].data() : out, tile);
+      });
   parallel_parts(rows, 1024, [&](int, int64_t begin, int64_t end) {
     for (int part = 1; part < parts; ++part)
       for (int64_t row = begin; row < end; ++row) reduce(out + width * row, others[part].data() + width * row);
@@ -36,8 +34,8 @@ void each_part(const View<S>& view, Bins& bins, S* out, int64_t rows, int64_t wi
 
 template <class S> void surfel_coverage(const SurfelCoverage<S>& a) {
   using P = Lanes<S>;
-  const auto add = [&](auto kernel, S* sums, int64_t tile) {
-    each_surfel<decltype(kernel), false>(a.view, a.alpha, *a.bins, tile, [&](int32_t id, auto&& blend) {
+  const auto add = [&](S* sums, int64_t tile) {
+    each_surfel<false>(a.view, a.alpha, *a.bins, tile, [&](int32_t id, auto&& blend) {
       const P zero = P(S(0));
       P largest = zero, weights = zero, squares = zero;
       blend([&](int, const typename P::M& taken, const Fragment<P>& f, P weight) {
@@ -76,14 +74,14 @@ template <class S> BT_HD void add_pair(Pair<S> pair, S* to) {
 
 template <class S> void texel_coverage(const TexelCoverage<S>& a) {
   using P = Lanes<S>;
-  const auto add = [&](auto kernel, S* sums, int64_t tile) {
+  const auto add = [&](S* sums, int64_t tile) {
     uint32_t counts[kBlocks];  // masks of the blocks' pixels that count
     std::fill(counts, counts + kBlocks, ~uint32_t(0));
     if (a.mask)
       each_pixel(tile, a.view.width, a.view.height, [&](int64_t pixel, int block, int lane) {
         if (!a.mask[pixel]) counts[block] &= ~(uint32_t(1) << lane);
       });
-    each_surfel<decltype(kernel), false>(a.view, a.alpha, *a.bins, tile, [&](int32_t id, auto&& blend) {
+    each_surfel<false>(a.view, a.alpha, *a.bins, tile, [&](int32_t id, auto&& blend) {
       const int32_t* size = a.size + 2 * int64_t(id);
       S* const to = sums + 2 * a.first[id];
       __builtin_prefetch(to, 1);

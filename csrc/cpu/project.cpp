@@ -31,7 +31,7 @@ template <class Kernel>
 Sight<P> sight(const Pinhole<float>& cam, int width, int height, const SurfelRow<P>& in, float near,
                const Resize<float>& to) {
   Sight<P> s;
-  s.projected = project<Kernel>(cam, in, near, s.geom, s.frame);
+  s.projected = project(cam, in, near, s.geom, s.frame);
   if constexpr (Kernel::kResized) s.projected = s.projected & resize(to, s.geom);
   const LevelExtent<P> e = level_extent<Kernel>(s.geom, width, height, double(to.sharp), kFloatRoom);
   find_seen(e.level.visible, e.conic, width, height, s);
@@ -68,10 +68,10 @@ template <class S> void project_forward(const ProjectForward<S>& a) {
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
   std::vector<int64_t> broken(num_threads(), 0);
   const Resize<S> to{a.photo_pixel};
-  with_kernel(a.prefilter, float(a.photo_pixel), [&](auto kernel) {
+  with_kernel(float(a.photo_pixel), [&](auto kernel) {
     parallel_parts(a.surfels.n, 1024, [&](int thread, int64_t begin, int64_t end) {
       using Kernel = decltype(kernel);
-      if constexpr (std::is_same_v<S, float> && !Kernel::kPixel)
+      if constexpr (std::is_same_v<S, float>)
         broken[thread] += project_lanes<Kernel>(cam, a, to, begin, end);
       else
         for (int64_t i = begin; i < end; ++i)

@@ -3,7 +3,7 @@
 
 #include <algorithm>
 
-#include "core/prefilter.h"
+#include "core/kernel.h"
 #include "cpu/simd.h"
 #include "ops/texel_alpha.h"
 

@@ -58,7 +58,7 @@ template <class S> struct TileState {
   template <class Kernel, bool kAll, class F, class C>
   void blend(const View<S>& view, const Bins& bins, int64_t id, F&& fn, S sharp, C&& cut) {
     const S *g = view.geom + id * kGeom, cx = g[kCx] - x0, cy = g[kCy] - y0;
-    const ReachedCells r = reached_in_tile<Kernel>(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
+    const ReachedCells r = reached_in_tile(g, cx, cy, view.radii + 2 * id, bins.level.data() + 2 * id);
     uint32_t blocks = open_blocks & (r.support | r.centre);
     // all fragments before any branch on them, to overlap their latencies
     Fragment<P> found[kBlocks];
@@ -66,14 +66,7 @@ template <class S> struct TileState {
     for (; blocks; blocks &= blocks - 1) {
       const int block = __builtin_ctz(blocks);
       const P dx = lane_x + P(kBlockOffsets<S>.column[block] - cx), dy = lane_y + P(kBlockOffsets<S>.row[block] - cy);
-      Fragment<P> f;
-      if (filtered<Kernel>(g)) {
-        const FilteredHit<P> hit = filtered_hit<S, P>(g, dx, dy);
-        if (!bits(open[block] & in_support(hit))) continue;
-        f = filtered_fragment<S, P>(g, view.near, hit);
-      } else {
-        f = fragment<Kernel>(g, view.near, dx, dy, r.centre >> block & 1, sharp);
-      }
+      const Fragment<P> f = fragment<Kernel>(g, view.near, dx, dy, r.centre >> block & 1, sharp);
       Fragment<P>& to = found[n];
       to.u = f.u, to.v = f.v, to.sigma = f.sigma;
       if constexpr (kAll) to.depth = f.depth, to.low_pass = f.low_pass;
@@ -99,7 +92,6 @@ template <class S> struct TileState {
     if (bits(v.takes)) fn(block, v.takes, f, b.weight);
     if (!bits(open[block])) open_blocks &= ~(1u << block);
   }
-  template <class Kernel>
   ReachedCells reached_in_tile(const S* g, S cx, S cy, const S* radius, const float* level) const {
     constexpr S kHalf = S(0.5 * (kBlockSide - 1));
     const P x = middle_x - P(cx), y = middle_y - P(cy);
@@ -108,7 +100,6 @@ template <class S> struct TileState {
     const bool boxless = max_(radius[0], radius[1]) >= S(kBoxless);
     const uint32_t box =
         boxless ? ~uint32_t(0) : bits((abs_(x) < P(radius[0] + half_x)) & (abs_(y) < P(radius[1] + half_y)));
-    if (filtered<Kernel>(g)) return {box, 0};
     const ReachedCells r = reached_cells(g, x, y, half_x, half_y, level);
     return {box & r.support, box & r.centre};
   }
@@ -116,7 +107,7 @@ template <class S> struct TileState {
 
 // Visits the surfels that a tile may show, front to back, while a pixel is open: fn(surfel, blend), where blend(take)
 // blends the surfel with its alpha texels; `take` as in TileState::blend.
-template <class Kernel, bool kAll, class S, class F>
+template <bool kAll, class S, class F>
 void each_surfel(const View<S>& view, const AlphaTiles<S>& alpha, const Bins& bins, int64_t tile, F&& fn) {
   using P = Lanes<S>;
   TileState<S> state(int(tile % bins.tiles_x), int(tile / bins.tiles_x), view.width, view.height);
@@ -125,7 +116,7 @@ void each_surfel(const View<S>& view, const AlphaTiles<S>& alpha, const Bins& bi
     if (k + kAhead < end) prefetch(view, bins, bins.surfels[k + kAhead]);
     const int32_t id = bins.surfels[k];
     if (!alpha.values) {
-      fn(id, [&](auto&& take) { state.template blend<Kernel, kAll>(view, bins, id, take); });
+      fn(id, [&](auto&& take) { state.template blend<LowPassKernel, kAll>(view, bins, id, take); });
       continue;
     }
     if (k + 2 * kAhead < end) {
@@ -135,7 +126,7 @@ void each_surfel(const View<S>& view, const AlphaTiles<S>& alpha, const Bins& bi
     const auto cut_by = [&](Fragment<P>& f, const typename P::M& covered, const P& transmittance) {
       cut(alpha, id, covered, transmittance, f);
     };
-    fn(id, [&](auto&& take) { state.template blend<Kernel, kAll>(view, bins, id, take, S(1), cut_by); });
+    fn(id, [&](auto&& take) { state.template blend<LowPassKernel, kAll>(view, bins, id, take, S(1), cut_by); });
   }
 }
 

@@ -19,8 +19,7 @@ constexpr int64_t kKept = int64_t(1) << 22;  // longest list that keeps its memo
 }  // namespace
 
 namespace {
-template <class Kernel, class S>
-void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most, Trace<S>& to) {
+template <class S> void list_fragments(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most, Trace<S>& to) {
   using P = Lanes<S>;
   using Chunk = typename FoundFragments<S>::Chunk;
   const Bins& bins = to.bins;
@@ -43,7 +42,7 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
     Chunk& a = own[at_chunk];
     const int64_t from = a.used, from_block = a.used_blocks;
     int64_t count = 0, blocks = 0;
-    each_surfel<Kernel, true>(view, alpha, bins, tile, [&](int32_t id, auto&& blend) {
+    each_surfel<true>(view, alpha, bins, tile, [&](int32_t id, auto&& blend) {
       blend([&](int block, const typename P::M& taken, const Fragment<P>& f, P weight) {
         const BlockPart part(bits(taken), block, id);
         if (keep) {
@@ -81,7 +80,7 @@ void trace_forward(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most
 template <class S> void trace_forward(const TraceForward<S>& a, Trace<S>& to) {
   const auto lists = binner(a.view, to.bins);
   run_together([&](const Member& m) { lists->run(m, nullptr); });
-  with_kernel(a.view.prefilter, [&](auto kernel) { trace_forward<decltype(kernel)>(a.view, a.alpha, a.most, to); });
+  list_fragments(a.view, a.alpha, a.most, to);
 }
 
 template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
@@ -124,8 +123,7 @@ template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
   if (large) list.chunks.clear();
 }
 
-namespace {
-template <class Kernel, class S> void trace_backward(const TraceBackward<S, TileBlocks>& a) {
+template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a) {
   using P = Lanes<S>;
   const S *geom = a.view.geom, *dweight = a.dweight, *duv = a.duv, *ddepth = a.ddepth;
   const S near = a.view.near, rim = a.rim;
@@ -155,8 +153,8 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
                         a.alpha.values ? f.uv : nullptr,
                         a.alpha.values ? f.uv + total : nullptr};
   constexpr int64_t kSoon = 256, kBlocksSoon = 6;
-  // sums of a part: 15 numbers per surfel (12 columns of geom, the area, two absolute gradients)
-  constexpr int kColumns = kBeta + 1, kSums = kColumns + 3;
+  // sums of a part: 14 numbers per surfel (12 columns of geom, two absolute gradients)
+  constexpr int kColumns = kBeta + 1, kSums = kColumns + 2;
   const int parts = parallel_tiles(layout.start, layout.tiles, most, [&](int part, int64_t first, int64_t last) {
     std::vector<S>& sums = partial[part];
     sums.assign(n * kSums, S(0));
@@ -179,7 +177,6 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
         P d[kGeom], ax = zero, ay = zero;
         const bool has_alpha = a.alpha.values && a.alpha.size[2 * id] > 0;
         for (int k = 0; k < kColumns; ++k) d[k] = zero;
-        d[kArea] = zero;
         each_block(layout, run, [&](int64_t, int64_t at, const BlockPart& of) {
           const auto there = mask_of<S>(of.lanes);
           const int64_t soon = std::max<int64_t>(at - kSoon, 0);
@@ -199,14 +196,13 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
             if (const uint32_t lanes = of.lanes & marks(v))
               AlphaLanes<S>(patch, u, v, lanes).gradient(listed, dsigma, gu, gv, of_tile);
           }
-          fragment_vjp<Kernel, S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
-                                     select(there, dsigma, zero), gu, gv, gradient(ddepth), d, ddx, ddy);
+          fragment_vjp<S, P>(g, near, rim, select(there, dx, zero), select(there, dy, zero), listed,
+                             select(there, dsigma, zero), gu, gv, gradient(ddepth), d, ddx, ddy);
           ax += abs_(ddx), ay += abs_(ddy);
         });
         S* to = sums.data() + id * kSums;
         for (int k = 0; k < kColumns; ++k) to[k] += sum(d[k]);
         to[kColumns] += sum(ax), to[kColumns + 1] += sum(ay);
-        to[kColumns + 2] += sum(d[kArea]);
       });
     }
   });
@@ -216,7 +212,6 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
         const S* from = partial[p].data() + i * kSums;
         for (int k = 0; k < kColumns; ++k) dgeom[i * kGeom + k] += from[k];
         absgrad[2 * i] += from[kColumns], absgrad[2 * i + 1] += from[kColumns + 1];
-        dgeom[i * kGeom + kArea] += from[kColumns + 2];
       }
     }
   });
@@ -224,11 +219,6 @@ template <class Kernel, class S> void trace_backward(const TraceBackward<S, Tile
     for (int p = 1; p < parts; ++p)
       for (int64_t t = begin; t < end; ++t) a.dtexel_alpha[t] += of_texels[p][t];
   });
-}
-}  // namespace
-
-template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a) {
-  with_kernel(a.view.prefilter, [&](auto kernel) { trace_backward<decltype(kernel)>(a); });
 }
 
 void list_ids(const ListedIds& a) {

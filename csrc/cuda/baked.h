@@ -34,7 +34,6 @@ struct BakedScene : BakedResidual {
   const AtlasTexture* levels[kTileLevels];
   int pages_down, page_width, page_height;  // pages per column, and their pitch
   float near;
-  int prefilter;  // selects a kernel of core/surfel.h
 
   template <class R>  // as in ops/arguments.h
   void fields(R& r) {
@@ -49,7 +48,6 @@ struct BakedScene : BakedResidual {
     if (levels[0]) r.numbers("pages_down", pages_down, "page_width", page_width, "page_height", page_height);
     BakedResidual::fields(r, n);
     r.number("near", near);
-    r.choice("prefilter", prefilter, kPrefilters);
   }
 };
 

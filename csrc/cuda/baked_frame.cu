@@ -57,7 +57,7 @@ size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t
 
 void baked_frame(const BakedDraw& a, Stream stream) {
   BakedFrame f = frame_of(a.scene->geometry.n, a.views, a.slots, a.capacity);
-  f.prefilter = a.scene->prefilter, f.photo_pixel = a.photo_pixel;
+  f.photo_pixel = a.photo_pixel;
   const int64_t needed = lay_out(f, a.memory.at, a.images.normal != nullptr);
   if (a.memory.bytes < needed)
     throw std::invalid_argument("the working memory has " + std::to_string(a.memory.bytes) +

@@ -58,7 +58,7 @@ __device__ void write_texture(const BakedScene& s, int64_t i, Vec3<float> color,
 // A block takes `owned` surfels. Those with many tiles or without a box are deferred, as the block with most of them
 // would dominate frame time.
 template <class Kernel>
-__global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blocks(9, kListThreads))
+__global__ void __launch_bounds__(kListThreads, bounded_blocks(9, kListThreads))
     list_kernel(BakedScene s, BakedViews v, BakedFrame f, int owned) {
   __shared__ int seen_count;
   __shared__ int seen_list[kListThreads];
@@ -78,12 +78,12 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
     const Surfels<float>& in = s.geometry;
     float geom[kGeom], frame[kFrame];
     const Pinhole<float> camera = pinhole(v.viewmats + 16 * view, v.Ks + 9 * view);
-    seen = project<Kernel>(camera, surfel_row(in, i), s.near, geom, frame);
+    seen = project(camera, surfel_row(in, i), s.near, geom, frame);
     const Resize<float> to(f.photo_pixel);
     if constexpr (Kernel::kResized) seen = seen && resize(to, geom);
     if (seen) {
       seen = level_row<Kernel>(geom, s.near, to.sharp, row);
-      const Footprint<float> of = footprint<Kernel>(row, v.width, v.height);
+      const Footprint<float> of = footprint(row, v.width, v.height);
       const Interval<float> x = columns_of(of);
       seen = seen && of.top <= of.bottom && (of.bounds.whole || (x.x1 >= 0 && x.x0 <= v.width));
       z = geom[kZ];
@@ -94,7 +94,7 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
       // if the nearest point of the disc lies beyond `near`, all of it does
       const PlaneBounds<float>& disc = of.bounds;
       const float nearest = z * (1 - sqrt_(disc.cu * disc.cu + disc.cv * disc.cv));
-      if (!Kernel::kPixel && row[kBlur2] == 0 && (disc.whole || !(nearest > s.near * 1.0001f))) row[kBlur2] = kNearCuts;
+      if (row[kBlur2] == 0 && (disc.whole || !(nearest > s.near * 1.0001f))) row[kBlur2] = kNearCuts;
     }
     if (seen) {
       float4* to = reinterpret_cast<float4*>(f.memory.rows + at * kRow);
@@ -121,13 +121,13 @@ __global__ void __launch_bounds__(kListThreads, Kernel::kPixel ? 1 : bounded_blo
 }
 
 // Lists a row of tiles of a surfel without a box, one tile per lane. Returns their number.
-template <class Kernel> __device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
+__device__ int list_reached(const BakedFrame& f, uint32_t r, int ty, int lane) {
   const float* row = f.memory.rows + int64_t(r) * kRow;
   const uint32_t tile = first_tile(f, r, ty);
   int listed = 0;
   for (int first = 0; first < f.tiles_x; first += kWarp) {
     const int tx = first + lane;
-    const uint32_t parts = tx < f.tiles_x ? reached_parts<Kernel>(row, tx, ty) : 0;
+    const uint32_t parts = tx < f.tiles_x ? reached_parts(row, tx, ty) : 0;
     listed += __popc(__ballot_sync(kFullMask, parts != 0));
     if (parts) list_pair(f, r, tile + uint32_t(tx), parts);
   }
@@ -135,17 +135,17 @@ template <class Kernel> __device__ int list_reached(const BakedFrame& f, uint32_
 }
 
 // Lists the deferred surfels, a warp per share of the tile rows of one.
-template <class Kernel> __global__ void __launch_bounds__(kListThreads, 4) large_pairs_kernel(BakedFrame f) {
+__global__ void __launch_bounds__(kListThreads, 4) large_pairs_kernel(BakedFrame f) {
   const BakedMemory& m = f.memory;
   const int lane = threadIdx.x % kWarp, warps = int(gridDim.x) * kListWarps;
   const int64_t shares = int64_t(*m.large_count) * kLargeParts;
   int64_t listed = 0;
   for (int64_t i = int64_t(blockIdx.x) * kListWarps + threadIdx.x / kWarp; i < shares; i += warps) {
     const uint32_t r = m.large[i / kLargeParts];
-    const Footprint<float> of = footprint<Kernel>(m.rows + int64_t(r) * kRow, f.width, f.height);
+    const Footprint<float> of = footprint(m.rows + int64_t(r) * kRow, f.width, f.height);
     for (int ty = of.top + int(i % kLargeParts); ty <= of.bottom; ty += kLargeParts) {
       if (of.bounds.whole) {
-        listed += list_reached<Kernel>(f, r, ty, lane);
+        listed += list_reached(f, r, ty, lane);
         continue;
       }
       const TileRow row = tile_row(of, ty, f.width);
@@ -166,13 +166,11 @@ void baked_list(const BakedScene& s, const BakedViews& v, const BakedFrame& f, S
   int owned = kListThreads;
   while (owned > kLeastOwned && ceil_div(f.rows, owned / 2) <= kMostBlocks) owned /= 2;
   const dim3 blocks(unsigned(ceil_div(f.n, owned)), unsigned(v.count));
-  with_kernel(f.prefilter, f.photo_pixel, [&](auto kernel) {
+  with_kernel(f.photo_pixel, [&](auto kernel) {
     BT_LAUNCH(list_kernel<decltype(kernel)>, blocks, dim3(kListThreads), 0, stream, s, v, f, owned);
   });
   const dim3 large(unsigned(min_<int64_t>(kLargeBlocks, ceil_div(f.rows * kLargeParts, kListWarps))));
-  with_kernel(f.prefilter, [&](auto kernel) {
-    BT_LAUNCH(large_pairs_kernel<decltype(kernel)>, large, dim3(kListThreads), 0, stream, f);
-  });
+  BT_LAUNCH(large_pairs_kernel, large, dim3(kListThreads), 0, stream, f);
 }
 
 }  // namespace bt::cuda

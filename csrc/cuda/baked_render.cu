@@ -137,8 +137,8 @@ __device__ __forceinline__ void add(const DrawArgs& a, const Row& s, const bool 
 
 // Evaluates and blends a row at the thread's pixels, the first at offset (dx, dy) from the projected centre, both at
 // once for instruction-level parallelism. Without kAll, neither the low pass nor the near plane is tested: for rows
-// that need no test. PixelKernel is only for rows that it filters.
-template <bool kMaps, bool kLevels, bool kAlpha, class Kernel, bool kAll>
+// that need no test.
+template <bool kMaps, class Kernel, bool kAlpha, bool kAll>
 __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx, float dy, Pixel (&p)[kPixels]) {
   Planes<FastFloat> at[kPixels];
   FastFloat y[kPixels];
@@ -147,12 +147,10 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   for (int j = 0; j < kPixels; ++j) {
     y[j] = FastFloat(j ? dy + kBandRows * j : dy);
     taken[j] = p[j].transmittance > 0;
-    if (!Kernel::kPixel) {  // the planes alone reject most pixels
-      at[j] = planes(s.g, FastFloat(dx), y[j]);
-      bool inside = within_in_front(at[j], FastFloat(s.r2));
-      if (kAll) inside = (inside & behind_near(s.g, a.near, at[j].W)) | (dx * dx + y[j].v * y[j].v < s.blur2);
-      taken[j] &= inside;
-    }
+    at[j] = planes(s.g, FastFloat(dx), y[j]);  // they alone reject most pixels
+    bool inside = within_in_front(at[j], FastFloat(s.r2));
+    if (kAll) inside = (inside & behind_near(s.g, a.near, at[j].W)) | (dx * dx + y[j].v * y[j].v < s.blur2);
+    taken[j] &= inside;
     any |= taken[j];
   }
   if (!any) return;
@@ -162,12 +160,12 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
   any = false;
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) {
-    if (Kernel::kPixel || kAll)
+    if (kAll)
       f[j] = fragment<Kernel, true>(s.g, a.near, FastFloat(dx), y[j], a.sharp);
     else
       f[j] = fragment_within(s.g, at[j]);
   }
-  if (kAlpha) cut<kLevels>(a, s, taken, p, f, texel);
+  if (kAlpha) cut<Kernel::kResized>(a, s, taken, p, f, texel);
   BT_UNROLL
   for (int j = 0; j < kPixels; ++j) {
     const float sigma = f[j].sigma.v;
@@ -179,7 +177,7 @@ __device__ __forceinline__ void blend(const DrawArgs& a, const Row& s, float dx,
     taken[j] = v.takes;
     any |= taken[j];
   }
-  if (any) add<kMaps, kLevels, kAlpha>(a, s, taken, weight, f, texel, p);
+  if (any) add<kMaps, Kernel::kResized, kAlpha>(a, s, taken, weight, f, texel, p);
 }
 
 // Rounds like the float image's conversion; the product must not be fused.
@@ -207,9 +205,6 @@ template <bool kMaps> __device__ void write(const DrawArgs& a, const Pixel& p, i
   }
 }
 
-// Kernel for rows that `Kernel` does not filter.
-template <class Kernel> using Unfiltered = std::conditional_t<Kernel::kResized, ResizedKernel, LowPassKernel>;
-
 // Tiles with long lists are drawn first, so that none is left at the end: blocks swap tiles with those of long lists.
 __device__ unsigned tile_of_block(const BakedMemory& m, unsigned block) {
   if (block < unsigned(*m.long_count)) return m.long_tiles[block];
@@ -220,14 +215,12 @@ __device__ unsigned tile_of_block(const BakedMemory& m, unsigned block) {
 
 // Blocks per multiprocessor: as many as the registers of the pair loop (without the sort) allow.
 template <bool kMaps, class Kernel, bool kAlpha>
-constexpr int kBlocks = bounded_blocks(
-    (kMaps ? (Kernel::kPixel ? 6 : 7) : (Kernel::kPixel || Kernel::kResized ? 8 : 9)) - int(kAlpha), kThreads);
+constexpr int kBlocks = bounded_blocks((kMaps ? 7 : (Kernel::kResized ? 8 : 9)) - int(kAlpha), kThreads);
 
 template <bool kMaps, class Kernel, bool kAlpha>
 __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw_kernel(DrawArgs a) {
   __shared__ float4 staged[kWarps][kWarp * kRowQuads];
   __shared__ uint32_t queues[kWarps][2 * kWarp];
-  constexpr bool kLevels = Kernel::kPixel || Kernel::kResized;  // only these kernels draw smaller views
   const int warp = threadIdx.x / kWarp, lane = threadIdx.x % kWarp;
   const BakedFrame& f = a.frame;
   const unsigned tile = f.rows ? tile_of_block(f.memory, blockIdx.x) : blockIdx.x;
@@ -278,10 +271,10 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw
       if (!__any_sync(kFullMask, open)) break;
       for (int k = begin; k < min_(begin + kCheckEvery, in_hand); ++k, q += kRowQuads) {
         const float4 q0 = q[0], q1 = q[1], q2 = q[2], q3 = q[3];
-        float area = Kernel::kPixel && q3.y < 0 ? -q3.y : 0.0f;
+        float height = 0;
         if (Kernel::kResized && q3.y > 0)
-          area = exp_(FastFloat(q3.y * a.sharp)).v * float(kAlphaMin) / q2.z;  // q2.z: opacity
-        const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, area},
+          height = exp_(FastFloat(q3.y * a.sharp)).v * float(kAlphaMin) / q2.z;  // q2.z: opacity
+        const Row s = {{q0.x, q0.y, q0.z, q0.w, q1.x, q1.y, q1.z, q1.w, q2.x, q2.y, q2.z, q2.w, 0, 0, 0, height},
                        q3.x,
                        q3.y,
                        q3.z,
@@ -289,12 +282,10 @@ __global__ void __launch_bounds__(kThreads, kBlocks<kMaps, Kernel, kAlpha>) draw
                        q + 4,
                        kMaps ? queue[k] >> 8 : 0};
         const float dx = px - s.g[kCx], dy = py - s.g[kCy];
-        if (filtered<Kernel>(s.g))
-          blend<kMaps, kLevels, kAlpha, Kernel, true>(a, s, dx, dy, p);
-        else if (Kernel::kPixel || s.blur2 != 0)
-          blend<kMaps, kLevels, kAlpha, Unfiltered<Kernel>, true>(a, s, dx, dy, p);
+        if (s.blur2 != 0)
+          blend<kMaps, Kernel, kAlpha, true>(a, s, dx, dy, p);
         else
-          blend<kMaps, kLevels, kAlpha, Unfiltered<Kernel>, false>(a, s, dx, dy, p);
+          blend<kMaps, Kernel, kAlpha, false>(a, s, dx, dy, p);
       }
     }
     wanted = 0;
@@ -330,7 +321,7 @@ void baked_draw(const BakedScene& s, const BakedImages& images, const BakedFrame
   const dim3 grid(static_cast<unsigned>(f.tiles));
   const bool maps = images.beta || images.depth || images.normal || images.overdraw;
   const bool alpha = s.alpha_scale != 0 || s.mean_alpha;
-  with_kernel(f.prefilter, f.photo_pixel, [&](auto kernel) {
+  with_kernel(f.photo_pixel, [&](auto kernel) {
     using Kernel = decltype(kernel);
     const auto draw = alpha ? (maps ? draw_kernel<true, Kernel, true> : draw_kernel<false, Kernel, true>)
                             : (maps ? draw_kernel<true, Kernel, false> : draw_kernel<false, Kernel, false>);

@@ -20,7 +20,7 @@ enum RowColumn {
   kRow = kSpanX + 2
 };
 static_assert(kRow == 24 && kR2 == 12);
-// No low pass, but pixels must be tested against the near plane; PixelKernel always tests rows that it does not filter.
+// No low pass, but pixels must be tested against the near plane.
 constexpr float kNearCuts = -1;
 
 // A screen tile's list: its first pairs are in its own slots, others in one list of all tiles, linked backwards. Four
@@ -61,7 +61,6 @@ struct BakedFrame {
   int long_from;              // pairs beyond which a list is long
   int width, height, tiles_x, tiles_y;
   int64_t tiles;      // of all views
-  int prefilter;      // as in BakedScene
   float photo_pixel;  // as in BakedDraw
   BakedMemory memory;
 };

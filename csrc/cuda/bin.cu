@@ -55,14 +55,14 @@ struct FillSpace {
 };
 
 // Tiles that a surfel can touch.
-template <class Kernel, class S> struct TouchedTiles {
+template <class S> struct TouchedTiles {
   S row[kLevelRow];
   Footprint<S> of;
   int width, height;
 
   __device__ TouchedTiles(const View<S>& v, int64_t id) : width(v.width), height(v.height) {
-    level_row<Kernel>(v.geom + id * kGeom, v.near, S(1), row);
-    of = footprint<Kernel>(row, width, height);
+    level_row<LowPassKernel>(v.geom + id * kGeom, v.near, S(1), row);
+    of = footprint(row, width, height);
   }
   // True for a disc that crosses the camera's plane and has no box.
   __device__ bool boxless() const { return of.bounds.whole; }
@@ -79,28 +79,27 @@ template <class Kernel, class S> struct TouchedTiles {
     const int across = tiles_across(width), tiles = across * tiles_across(height);
     for (int first = 0; first < tiles; first += kWarp) {
       const int tile = first + lane, ty = tile / across;
-      const unsigned votes =
-          __ballot_sync(kFullMask, tile < tiles && reached_parts<Kernel>(row, tile - ty * across, ty) != 0);
+      const unsigned votes = __ballot_sync(kFullMask, tile < tiles && reached_parts(row, tile - ty * across, ty) != 0);
       if (votes) fn(votes, tile);
     }
   }
 };
 
-template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) count_kernel(View<S> v, CountSpace<S> w) {
+template <class S> __global__ void __launch_bounds__(kThreads) count_kernel(View<S> v, CountSpace<S> w) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   const int lane = int(threadIdx.x) % kWarp;
   const bool visible = i < v.n && v.radii[2 * i] > S(0);
   bool crosses = false;
   int64_t count = 0;
   if (visible) {
-    const TouchedTiles<Kernel, S> touched(v, i);
+    const TouchedTiles<S> touched(v, i);
     crosses = touched.boxless();
     if (!crosses) touched.each_row([&](int, int first, int last) { count += last - first + 1; });
   }
   for (unsigned todo = __ballot_sync(kFullMask, crosses); todo;) {
     const int j = take_first(todo);
     int reached = 0;
-    TouchedTiles<Kernel, S>(v, i - lane + j).each_reached(lane, [&](unsigned votes, int) { reached += __popc(votes); });
+    TouchedTiles<S>(v, i - lane + j).each_reached(lane, [&](unsigned votes, int) { reached += __popc(votes); });
     if (lane == j) count = reached;
   }
   if (i >= v.n) return;
@@ -120,7 +119,7 @@ __global__ void __launch_bounds__(kThreads)
 // camera does not leave the whole screen to one thread. Counts come from another kernel, which may round differently
 // (cmake/cuda.cmake prevents that for nvcc). In any case no thread writes past its slots, and slots without a tile
 // become pairs after those of all tiles.
-template <class Kernel, class S>
+template <class S>
 __global__ void __launch_bounds__(kThreads)
     list_kernel(View<S> v, const int32_t* order, const int64_t* slot_start, FillSpace w) {
   const int64_t r = int64_t(blockIdx.x) * kThreads + threadIdx.x;
@@ -133,7 +132,7 @@ __global__ void __launch_bounds__(kThreads)
     w.owner[slot] = whose;
   };
   // lists the tiles of a box, this being thread `mine` of `step`; returns the next slot
-  using Touched = TouchedTiles<Kernel, S>;
+  using Touched = TouchedTiles<S>;
   const auto list_box = [&](const Touched& touched, int32_t whose, int64_t at, int64_t end, int mine, int step) {
     touched.each_row([&](int row, int first, int last) {
       for (int column = first + mine; column <= last; column += step) {
@@ -213,10 +212,7 @@ template <class S> void bin_count(const BinCount<S>& a, Stream stream) {
   const int64_t n = v.n;
   Arena arena(a.workspace.of(bin_count_workspace<S>(n)));
   const CountSpace<S> w(arena, n);
-  if (n)
-    with_kernel(v.prefilter, [&](auto kernel) {
-      BT_LAUNCH((count_kernel<decltype(kernel), S>), blocks(n), dim3(kThreads), 0, stream, v, w);
-    });
+  if (n) BT_LAUNCH(count_kernel<S>, blocks(n), dim3(kThreads), 0, stream, v, w);
   sort_pairs(w.keys, w.sorted, w.rows, a.order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
   BT_LAUNCH(rank_kernel, blocks(n + 1), dim3(kThreads), 0, stream, n, a.order, w.counts, w.ranked);
   exclusive_sum(w.ranked, a.slot_start, n + 1, w.temp, w.temp_size, stream);
@@ -228,10 +224,7 @@ template <class S> void bin_fill(const BinFill<S>& a, Stream stream) {
   Arena arena(a.workspace.of(bin_fill_workspace(pairs, v.width, v.height)));
   const FillSpace w(arena, pairs, tiles);
   if (pairs) {
-    with_kernel(v.prefilter, [&](auto kernel) {
-      BT_LAUNCH((list_kernel<decltype(kernel), S>), blocks(v.n), dim3(kThreads), 0, stream, v, a.order, a.slot_start,
-                w);
-    });
+    BT_LAUNCH(list_kernel<S>, blocks(v.n), dim3(kThreads), 0, stream, v, a.order, a.slot_start, w);
     sort_pairs(w.tile, w.sorted, w.slots, a.slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
     BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, a.slot, w.owner, a.surfel);
   }

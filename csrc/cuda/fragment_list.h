@@ -89,7 +89,6 @@ template <class S> __device__ inline void load_shape(const S* row, S* g) {
 #else
   for (int i = 0; i < kShape; ++i) g[i] = row[i];
 #endif
-  g[kArea] = row[kArea];
 }
 
 // Rows of geom for up to 32 pairs, in shared memory.
@@ -117,7 +116,7 @@ template <class S> struct SurfelRows {
 template <class S> struct StoreGeomGradient {
   S *dgeom, *absgrad;
   __device__ void operator()(int64_t surfel, int column, S sum) const {
-    dgeom[surfel * kGeom + column] = column < kShape || column == kArea ? sum : S(0);
+    dgeom[surfel * kGeom + column] = column < kShape ? sum : S(0);
     if (column >= kShape && column < kShape + 2) absgrad[2 * surfel + column - kShape] = sum;
   }
 };

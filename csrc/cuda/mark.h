@@ -10,8 +10,7 @@
 namespace bt::cuda {
 
 // Returns true if the support or low pass of a surfel without a box may reach the warp's pixels.
-template <class Kernel, class S> __device__ bool reached_by_warp(const S* g, const TileThread& s) {
-  if (filtered<Kernel>(g)) return true;
+template <class S> __device__ bool reached_by_warp(const S* g, const TileThread& s) {
   const S x = S(s.left) + S(0.5 * kWarpWidth) - g[kCx], y = S(s.top) + S(0.5 * kWarpHeight) - g[kCy];
   const Reached<S> r = reached(g, x, y, cell_half(S(0.5 * (kWarpWidth - 1)), g[kCx], abs_(x) + S(kTile)),
                                cell_half(S(0.5 * (kWarpHeight - 1)), g[kCy], abs_(y) + S(kTile)), S(kSupport2),
@@ -22,7 +21,7 @@ template <class Kernel, class S> __device__ bool reached_by_warp(const S* g, con
 // Writes the masks of a tile's pairs and, with kAlpha and unless null, `cuts`: the fragments whose sigma alpha texels
 // multiplied. Calls blended(surfel, g, fragment, weight) for every fragment, in the lane of its pixel. Returns the
 // remaining transmittance.
-template <class Kernel, bool kAlpha, class S, class Blended>
+template <bool kAlpha, class S, class Blended>
 __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>& alpha, int64_t pairs,
                                         const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks,
                                         uint32_t* cuts, const TileThread& s, Blended&& blended) {
@@ -44,7 +43,7 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
       const S rx = view.radii[2 * int64_t(id)], ry = view.radii[2 * int64_t(id) + 1];
       // the centre of a disc without a box may lie beyond its radii
       if (max_(rx, ry) >= S(kBoxless))
-        meets = reached_by_warp<Kernel>(g, s);
+        meets = reached_by_warp(g, s);
       else
         meets = g[kCx] + rx >= S(s.left) && g[kCx] - rx <= S(s.left + kWarpWidth) && g[kCy] + ry >= S(s.top) &&
                 g[kCy] - ry <= S(s.top + kWarpHeight);
@@ -59,10 +58,8 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
       // a cheap test first: any open pixel in the support or near the centre
       const bool close = near_centre(dx, dy);
-      const bool reached = filtered<Kernel>(g) ? in_support(filtered_hit<S, T>(g, dx, dy))
-                                               : close || in_support(planes<S, T>(g, dx, dy));
-      if (!__any_sync(kFullMask, open && reached)) continue;
-      const Fragment<T> f = fragment<Kernel>(g, view.near, dx, dy, __any_sync(kFullMask, close));
+      if (!__any_sync(kFullMask, open && (close || in_support(planes<S, T>(g, dx, dy))))) continue;
+      const Fragment<T> f = fragment<LowPassKernel>(g, view.near, dx, dy, __any_sync(kFullMask, close));
       S sigma = plain(f.sigma);
       bool is_cut = false;
       if constexpr (kAlpha) {

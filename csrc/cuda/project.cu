@@ -8,19 +8,19 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 128;
 
-template <class Kernel, class S> __global__ void __launch_bounds__(kThreads) forward_kernel(ProjectForward<S> a) {
+template <class S> __global__ void __launch_bounds__(kThreads) forward_kernel(ProjectForward<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i >= a.surfels.n) return;
   const Pinhole<S> cam = pinhole(a.viewmat, a.K);
   const auto mark = [&](Sight<S>& s) {
     S row[kLevelRow];
-    const bool visible = level_row<Kernel>(s.geom, a.near, S(1), row);
-    auto [bounds, pad] = row_bounds<Kernel>(row, a.width, a.height);
+    const bool visible = level_row<LowPassKernel>(s.geom, a.near, S(1), row);
+    auto [bounds, pad] = row_bounds(row, a.width, a.height);
     bounds.x0 -= pad, bounds.x1 += pad, bounds.y0 -= pad, bounds.y1 += pad;
     find_seen(visible, bounds, a.width, a.height, s);
   };
   const bool fine =
-      project_visible<Kernel>(cam, a.surfels, i, a.near, Resize<S>(S(1)), a.geom, a.frames, a.radii, mark);
+      project_visible<LowPassKernel>(cam, a.surfels, i, a.near, Resize<S>(S(1)), a.geom, a.frames, a.radii, mark);
   if (!fine) atomicAdd(a.broken, 1);
 }
 
@@ -36,10 +36,7 @@ template <class S> __global__ void __launch_bounds__(kThreads) backward_kernel(P
 template <class S> void project_forward(const ProjectForward<S>& a, Stream stream) {
   const int64_t n = a.surfels.n;
   if (!n) return;
-  with_kernel(a.prefilter, [&](auto kernel) {
-    BT_LAUNCH((forward_kernel<decltype(kernel), S>), dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream,
-              a);
-  });
+  BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, a);
 }
 template <class S> void project_backward(const ProjectBackward<S>& a, Stream stream) {
   const int64_t n = a.surfels.n;

@@ -17,20 +17,20 @@ namespace bt::cuda {
 
 namespace {
 
-template <class Kernel, class S, bool kAlpha>
+template <class S, bool kAlpha>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_kernel(RasterizeForward<S> a) {
   using T = FastFloatOr<S>;
   const TileThread s = tile_thread(a.view.width);
   S sum[kImageChannels];
   for (int c = 0; c < kImageChannels; ++c) sum[c] = S(0);
-  const S behind = mark_pairs<Kernel, kAlpha>(a.view, a.alpha, a.pairs, a.surfel, a.tile_pairs, a.masks, a.cuts, s,
-                                              [&](int64_t id, const S* g, const Fragment<T>& f, S weight) {
-                                                const TexelPatch<S> patch(a.table, id);
-                                                const Vec3<S> c = patch.color(weight, a.bound, plain(f.u), plain(f.v));
-                                                const S color[3] = {c.x, c.y, c.z};
-                                                add_blended<false>(weight, color, g[kBeta], S(0),
-                                                                   static_cast<const S*>(nullptr), sum);
-                                              });
+  const S behind =
+      mark_pairs<kAlpha>(a.view, a.alpha, a.pairs, a.surfel, a.tile_pairs, a.masks, a.cuts, s,
+                         [&](int64_t id, const S* g, const Fragment<T>& f, S weight) {
+                           const TexelPatch<S> patch(a.table, id);
+                           const Vec3<S> c = patch.color(weight, a.bound, plain(f.u), plain(f.v));
+                           const S color[3] = {c.x, c.y, c.z};
+                           add_blended<false>(weight, color, g[kBeta], S(0), static_cast<const S*>(nullptr), sum);
+                         });
   if (s.x >= a.view.width || s.y >= a.view.height) return;
   const int64_t pixel = int64_t(s.y) * a.view.width + s.x;
   for (int c = 0; c < kImageChannels; ++c) a.image[pixel * kImageChannels + c] = sum[c];
@@ -125,7 +125,7 @@ template <class S> struct Held : SurfelRows<S> {
   }
 };
 
-template <class Kernel, class S, bool kAlpha, bool kTexels>
+template <class S, bool kAlpha, bool kTexels>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward_kernel(RasterizeBackward<S> a) {
   using T = FastFloatOr<S>;
   constexpr int kColors = Held<S>::kColors;
@@ -154,7 +154,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       load_shape(held.rows[j].g, g);
       const T dx = T(pixel_centre<S>(s.x) - g[kCx]), dy = T(pixel_centre<S>(s.y) - g[kCy]);
       const Fragment<T> f =
-          fragment<Kernel>(g, a.view.near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+          fragment<LowPassKernel>(g, a.view.near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
       if (!mine) return;
       // the forward pass found at least that much, perhaps rounded differently
       S sigma = max_(plain(f.sigma), S(kAlphaMin));
@@ -233,9 +233,9 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       }
       if (mine) {
         const int pixel = bits & kPixel;
-        fragment_vjp<Kernel, S, T>(g, a.view.near, a.rim, T(pixel_centre<S>(tile_left + pixel % kTile) - g[kCx]),
-                                   T(pixel_centre<S>(tile_top + pixel / kTile) - g[kCy]), T(sigma), T(gs), T(gu), T(gv),
-                                   T(S(0)), sums, ddx, ddy);
+        fragment_vjp<S, T>(g, a.view.near, a.rim, T(pixel_centre<S>(tile_left + pixel % kTile) - g[kCx]),
+                           T(pixel_centre<S>(tile_top + pixel / kTile) - g[kCy]), T(sigma), T(gs), T(gu), T(gv),
+                           T(S(0)), sums, ddx, ddy);
       }
       sums[kShape] = abs_(ddx), sums[kShape + 1] = abs_(ddy);
       S plain_sums[kTraceSums];
@@ -275,25 +275,18 @@ template <class S> struct PutTexel {
 }  // namespace
 
 template <class S> void rasterize_forward(const RasterizeForward<S>& a, Stream stream) {
-  with_kernel(a.view.prefilter, [&](auto kernel) {
-    using Kernel = decltype(kernel);
-    const auto run = a.alpha.values ? forward_kernel<Kernel, S, true> : forward_kernel<Kernel, S, false>;
-    BT_LAUNCH(run, dim3(unsigned(tiles_of(a.view.width, a.view.height))), dim3(kTileThreads), 0, stream, a);
-  });
+  const auto run = a.alpha.values ? forward_kernel<S, true> : forward_kernel<S, false>;
+  BT_LAUNCH(run, dim3(unsigned(tiles_of(a.view.width, a.view.height))), dim3(kTileThreads), 0, stream, a);
 }
 
 template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream stream) {
   const Pairs& p = a.layout;
   if (a.texel_sums) each_shown_texel(p, a.table, ClearTexel<S>{a.texel_sums}, stream);
   fill_zero(a.dtexel_alpha, a.dtexel_alpha ? a.alpha.texels : 0, stream);
-  if (p.pairs)
-    with_kernel(a.view.prefilter, [&](auto kernel) {
-      using Kernel = decltype(kernel);
-      const auto run = a.alpha.values   ? backward_kernel<Kernel, S, true, true>
-                       : a.table.texels ? backward_kernel<Kernel, S, false, true>
-                                        : backward_kernel<Kernel, S, false, false>;
-      BT_LAUNCH(run, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a);
-    });
+  const auto run = a.alpha.values   ? backward_kernel<S, true, true>
+                   : a.table.texels ? backward_kernel<S, false, true>
+                                    : backward_kernel<S, false, false>;
+  if (p.pairs) BT_LAUNCH(run, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a);
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
   sum_slots<Held<S>::kColors>(p, static_cast<const S*>(a.color_partial), StoreColorGradient<S>{a.table.base, a.dbase},
                               stream);

@@ -23,12 +23,12 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-template <class Kernel, class S, bool kAlpha>
+template <class S, bool kAlpha>
 __global__ void __launch_bounds__(kTileThreads)
     mark_kernel(View<S> view, AlphaTiles<S> alpha, int64_t pairs, const int32_t* surfel, const int64_t* tile_pairs,
                 uint32_t* masks) {
-  mark_pairs<Kernel, kAlpha>(view, alpha, pairs, surfel, tile_pairs, masks, static_cast<uint32_t*>(nullptr),
-                             tile_thread(view.width), [](int64_t, const S*, const Fragment<FastFloatOr<S>>&, S) {});
+  mark_pairs<kAlpha>(view, alpha, pairs, surfel, tile_pairs, masks, static_cast<uint32_t*>(nullptr),
+                     tile_thread(view.width), [](int64_t, const S*, const Fragment<FastFloatOr<S>>&, S) {});
 }
 
 // Pairs after those of the tiles have no masks.
@@ -45,7 +45,7 @@ __global__ void __launch_bounds__(kThreads)
 // A warp has about ten fragments of a pair, which rarely fill a sector of 32 bytes, and partial sectors are slower to
 // write than whole ones. So a block collects the fragments of up to 32 pairs, in list order, and writes them
 // contiguously.
-template <class Kernel, class S, bool kAlpha>
+template <class S, bool kAlpha>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
                                                 : kAlpha       ? 5
                                                                : 6)
@@ -73,7 +73,8 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
       S g[kGeom];
       load_shape(held.rows[j].g, g);
       const T dx = T(x - g[kCx]), dy = T(y - g[kCy]);
-      const Fragment<T> f = fragment<Kernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
+      const Fragment<T> f =
+          fragment<LowPassKernel>(g, near, dx, dy, __any_sync(kFullMask, mine && near_centre(dx, dy)));
       if (!mine) return;
       // trace_mark found at least that much. Where the kernel is discontinuous, different rounding may give 0 here, and
       // the gradient would divide by it.
@@ -146,13 +147,10 @@ template <class S> void trace_mark(const TraceMark<S>& a, Stream stream) {
   const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
   Arena arena(a.workspace.of(trace_mark_workspace(pairs)));
   const MarkSpace w(arena, pairs);
+  const auto mark = a.alpha.values ? mark_kernel<S, true> : mark_kernel<S, false>;
   if (pairs)
-    with_kernel(v.prefilter, [&](auto kernel) {
-      const auto mark =
-          a.alpha.values ? mark_kernel<decltype(kernel), S, true> : mark_kernel<decltype(kernel), S, false>;
-      BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v, a.alpha, pairs, a.surfel, a.tile_pairs,
-                a.masks);
-    });
+    BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v, a.alpha, pairs, a.surfel, a.tile_pairs,
+              a.masks);
   BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs,
             a.tile_pairs + tiles, a.masks, w.counts);
   exclusive_sum(w.counts, a.offsets, pairs + 1, w.temp, w.temp_size, stream);
@@ -161,11 +159,9 @@ template <class S> void trace_mark(const TraceMark<S>& a, Stream stream) {
 template <class S> void trace_fill(const TraceFill<S>& a, Stream stream) {
   const Pairs& p = a.fragments.layout;
   if (!p.fragments) return;
-  with_kernel(a.view.prefilter, [&](auto kernel) {
-    const auto fill = a.alpha.values ? fill_kernel<decltype(kernel), S, true> : fill_kernel<decltype(kernel), S, false>;
-    BT_LAUNCH(fill, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.view.geom, a.view.near, a.alpha, p,
-              a.fragments.f);
-  });
+  const auto fill = a.alpha.values ? fill_kernel<S, true> : fill_kernel<S, false>;
+  BT_LAUNCH(fill, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a.view.geom, a.view.near, a.alpha, p,
+            a.fragments.f);
 }
 
 void masked_counts(const MaskedCounts<Pairs>& a, Stream stream) {

@@ -45,7 +45,7 @@ template <class S> struct AlphaGradient {
   ExactSums exact;
 };
 
-template <class Kernel, class S, bool kAlpha, bool kExact>
+template <class S, bool kAlpha, bool kExact>
 __global__ void __launch_bounds__(kRunThreads)
     surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, AlphaGradient<S> alpha, const S* dsigma,
                   const S* duv, const S* ddepth, S* partial) {
@@ -88,8 +88,8 @@ __global__ void __launch_bounds__(kRunThreads)
     if (mine) {
       const int32_t y = row_of(pixel), x = pixel - y * p.width;
       T ddx, ddy;
-      fragment_vjp<Kernel, S, T>(g, near, rim, T(pixel_centre<S>(x) - g[kCx]), T(pixel_centre<S>(y) - g[kCy]),
-                                 T(listed), T(gs), T(gu), T(gv), T(gz), d, ddx, ddy);
+      fragment_vjp<S, T>(g, near, rim, T(pixel_centre<S>(x) - g[kCx]), T(pixel_centre<S>(y) - g[kCy]), T(listed), T(gs),
+                         T(gu), T(gv), T(gz), d, ddx, ddy);
       ax += abs_(ddx), ay += abs_(ddy);
     }
   }
@@ -117,15 +117,12 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
                               dsigma, stream);
   else
     fill_zero(a.dtexel_alpha, texels, stream);
+  const auto run = exact  ? surfel_kernel<S, true, true>
+                   : cuts ? surfel_kernel<S, true, false>
+                          : surfel_kernel<S, false, false>;
   if (p.pairs)
-    with_kernel(a.view.prefilter, [&](auto kernel) {
-      using Kernel = decltype(kernel);
-      const auto run = exact  ? surfel_kernel<Kernel, S, true, true>
-                       : cuts ? surfel_kernel<Kernel, S, true, false>
-                              : surfel_kernel<Kernel, S, false, false>;
-      BT_LAUNCH(run, run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom, a.view.near, a.rim, p, f, alpha, dsigma,
-                a.duv, a.ddepth, a.partial);
-    });
+    BT_LAUNCH(run, run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom, a.view.near, a.rim, p, f, alpha, dsigma,
+              a.duv, a.ddepth, a.partial);
   if (exact) end_exact(alpha.exact, texels, a.dtexel_alpha, stream);
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
 }

@@ -56,7 +56,7 @@ template <class S> struct Spaces {
     Arena arena(drawn.pair_memory.of(bytes));
     return PairSpace<S>(arena, drawn.pairs, v.width, v.height, alpha);
   }
-  View<S> view() const { return {v.surfels.n, v.geom, v.radii, v.width, v.height, v.near, v.prefilter, S(1)}; }
+  View<S> view() const { return {v.surfels.n, v.geom, v.radii, v.width, v.height, v.near, S(1)}; }
   Directions<S> directions() const { return {v.surfels.n, v.surfels.means, v.center, of.active}; }
 
  private:
@@ -104,8 +104,8 @@ template <class S> int64_t count_view(const TrainingView<S>& a, Stream stream) {
   const Spaces<S> s(a);
   const int64_t n = a.surfels.n;
   fill_zero(a.broken, 1, stream);
-  project_forward(ProjectForward<S>{a.surfels, a.viewmat, a.K, a.width, a.height, a.near, a.prefilter, S(1), a.geom,
-                                    a.frames, a.radii, a.broken},
+  project_forward(ProjectForward<S>{a.surfels, a.viewmat, a.K, a.width, a.height, a.near, S(1), a.geom, a.frames,
+                                    a.radii, a.broken},
                   stream);
   if (n)
     BT_LAUNCH(active_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, a.radii,

@@ -14,7 +14,7 @@ template <class S> struct TrainingView {
   Surfels<S> surfels;
   const S *viewmat, *K;
   const double* center;  // [3] of the camera, world
-  int width, height, prefilter;
+  int width, height;
   S near, rim, bound;
   ViewColorArrays<const S> colors;
   TexelTiles<S> table;  // base is set by the calls
@@ -32,7 +32,6 @@ template <class S> struct TrainingView {
     r.array("K", K, 9);
     r.array("center", center, 3);
     r.numbers("width", width, "height", height, "near", near, "rim", rim, "bound", bound, "moves", moves);
-    r.choice("prefilter", prefilter, kPrefilters);
     colors.fields(r, surfels.n);
     table.tiles(r);
     alpha.fields(r, surfels.n);

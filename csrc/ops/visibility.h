@@ -11,14 +11,13 @@ namespace bt {
 
 // viewmat [4, 4] and K [3, 3] are on the surfels' device. Writes geom [n, kGeom], frames [n, kFrame] and radii [n, 2]
 // (half extents of the level-set box in pixels); rows of invisible surfels are zero. Adds the number of rows that are
-// not finite to broken [1]. `prefilter` and `photo_pixel` select a kernel of core/surfel.h and must be the same
-// wherever the rows are used; a photo_pixel other than 1 is for the baked renderer only.
+// not finite to broken [1]. `photo_pixel` selects a kernel of core/surfel.h and must be the same wherever
+// the rows are used; other than 1 it is for the baked renderer only.
 template <class S> struct ProjectForward {
   Surfels<S> surfels;
   const S *viewmat, *K;
   int width, height;
   S near;
-  int prefilter;
   S photo_pixel;  // side of a photograph's pixel in pixels of the view
   S *geom, *frames, *radii;
   int32_t* broken;
@@ -28,7 +27,6 @@ template <class S> struct ProjectForward {
     r.array("viewmat", viewmat, 16);
     r.array("K", K, 9);
     r.numbers("width", width, "height", height, "near", near);
-    r.choice("prefilter", prefilter, kPrefilters);
     r.number("photo_pixel", photo_pixel);
     r.array("geom", geom, surfels.n * kGeom);
     r.array("frames", frames, surfels.n * kFrame);
@@ -60,21 +58,19 @@ template <class S> struct View {
   const S *geom, *radii;
   int width, height;
   S near;
-  int prefilter;
   S photo_pixel;
 
   template <class R> void fields(R& r) {
     r.rows("radii", radii, n, 2);
     r.wide("geom", geom, n * kGeom);
     r.numbers("width", width, "height", height, "near", near);
-    r.choice("prefilter", prefilter, kPrefilters);
     r.number("photo_pixel", photo_pixel);
   }
 };
 
 // Writes dgeom [n, kGeom] and absgrad [n, 2]. dweight, duv, ddepth may be null (zero); rim as in fragment_vjp
 // (core/kernel.h). dsigma and partial are working memory: a row of partial has the sums of a pair (a surfel in a screen
-// tile), gradients of columns 0 to kBeta of geom, two absolute gradients, one unused, and the gradient of kArea.
+// tile), gradients of columns 0 to kBeta of geom, two absolute gradients, and two unused.
 constexpr int kTraceSums = 16;
 template <class S, class Layout> struct TraceBackward {
   View<S> view;

@@ -69,7 +69,7 @@ def scene():
     def make(count: int = 200, field: object = "wave", kind: str = "sv", seed: int = 0) -> SimpleNamespace:
         field = WaveField() if field == "wave" else field
         surfels = make_surfels(count, kind, seed)
-        config = SimpleNamespace(weight_bound=0.0, prefilter="low_pass")
+        config = SimpleNamespace(weight_bound=0.0)
         return SimpleNamespace(surfels=surfels, field=field, near=0.25, config=config)
 
     return make

@@ -13,7 +13,7 @@ from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.scene.baked import BakedScene
 
-OF_THE_SCENE = ("extent", "mean_residual", "mean_alpha", "near", "weight_bound", "prefilter", "photographed")
+OF_THE_SCENE = ("extent", "mean_residual", "mean_alpha", "near", "weight_bound", "photographed")
 
 
 def write(

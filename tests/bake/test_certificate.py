@@ -154,7 +154,7 @@ def test_texels_that_were_altered_fail_behind_a_good_hash(tuned: BakeState, trut
     stated = baked.statistics.certificate
     cameras = [view.camera for view in photographs(truth)]
     drawn = baked.scene
-    found = visibility(drawn.surfels, cameras, drawn.near, drawn.weight_bound, drawn.prefilter).in_front
+    found = visibility(drawn.surfels, cameras, drawn.near, drawn.weight_bound).in_front
     assert (baked.in_front - found).abs().mean() < 0.02  # in the order of the bundle; compact ones are rounded
     assert stated is not None and stated.against == "texels" and stated.within + stated.beyond <= len(baked.rows)
     export(baked, tmp_path / "b")

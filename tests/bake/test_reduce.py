@@ -142,7 +142,7 @@ def test_texels_out_of_sight_do_not_widen_the_range(discs):
 def test_what_is_hidden_counts_less(discs):
     made, axes = discs()
     made.field = PlaneField(axes[:, 0], 25.0)
-    inputs = BakeInput(made.surfels, (), 0.2, BOUND, "low_pass")
+    inputs = BakeInput(made.surfels, (), 0.2, BOUND)
 
     def grids_behind(transmittance):
         views = SimpleNamespace(in_front=torch.full((8,), transmittance))

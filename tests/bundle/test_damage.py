@@ -87,6 +87,7 @@ def test_versions(surfels, tmp_path):
         (lambda i: i["render"].update(near=0), "render.near must be greater than or equal to .*, not 0"),
         (lambda i: i["render"].update(background=[0, 9e29, 0]), "render.background.1 must be less than or equal to 1"),
         (lambda i: i["render"].update(weight_bound=False), "render.weight_bound must be a valid number, not False"),
+        (lambda i: i["render"].update(prefilter="pixel"), "render.prefilter must be 'low_pass', not 'pixel'"),
         (lambda i: i["render"].update(t_min=1e-3), "render.t_min must be 0.0001, which is what is drawn"),
         (lambda i: i["surfels"].update(support=4), "surfels.support must be 3.0"),
         (lambda i: i.update(color_bias=0), "color_bias must be 0.5"),

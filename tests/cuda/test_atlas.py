@@ -14,12 +14,11 @@ from tests.cuda.baked_scenes import front, textured
 
 
 @pytest.mark.parametrize("photo_pixel", [1.0, 0.5, 0.25])
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 def test_where_pages_lie_in_the_texture_does_not_show(
-    prefilter: str, photo_pixel: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
+    photo_pixel: float, device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Pages in a column, a row, a grid with a gap, and with sides off any grid."""
-    scene = replace(textured(30, 5), prefilter=prefilter)
+    scene = textured(30, 5)
     assert scene.atlas is not None
     atlas = torch.cat([scene.atlas, scene.atlas.flip(1)[:1]])
     tiles = scene.tiles.clone()

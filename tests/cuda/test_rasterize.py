@@ -41,12 +41,11 @@ class Learned:
         dtype: torch.dtype,
         device: torch.device,
         texture: str = "alphas",
-        prefilter: ops.Prefilter = "low_pass",
         extreme: bool = False,
         moved: bool = False,
     ) -> None:
         n, g = len(case.params["means"]), torch.Generator().manual_seed(len(case.params["means"]))
-        self.camera, self.prefilter = camera_of(case, dtype), prefilter
+        self.camera = camera_of(case, dtype)
         self.leaves = {name: case.params[name].to(device, dtype).clone().requires_grad_() for name in GEOMETRY}
         self.base = (torch.rand(n, 3, generator=g, dtype=torch.float64) * 1.4 - 0.9).to(device, dtype)
         self.leaves["base"] = self.base.requires_grad_()
@@ -75,7 +74,7 @@ class Learned:
 
     def draw(self, listed: bool, moves: bool = True) -> dict[str, Tensor]:
         """Compute the picture, all gradients of a sum over it, and the texels afterwards."""
-        projection = ops.project(*(self.leaves[name] for name in GEOMETRY), self.camera, prefilter=self.prefilter)
+        projection = ops.project(*(self.leaves[name] for name in GEOMETRY), self.camera)
         projection.alpha = self.alpha
         how = {**self.texture, "move_surfels": moves}
         if listed:
@@ -98,16 +97,15 @@ def compare(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: float) -
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("texture, moves", [("none", True), ("colors", True), ("colors", False), ("alphas", True)])
 def test_pictures_and_gradients_are_those_of_the_cpu(
-    texture: str, moves: bool, prefilter: ops.Prefilter, dtype: torch.dtype, device: torch.device, cpu: Context
+    texture: str, moves: bool, dtype: torch.dtype, device: torch.device, cpu: Context
 ) -> None:
     """Tiles with more fragments than shared memory holds and more than 32 surfels; the image ends within one."""
     case = random_scene(150, 3, width=70, height=40)
-    got = Learned(case, dtype, device, texture, prefilter).draw(False, moves)
+    got = Learned(case, dtype, device, texture).draw(False, moves)
     with cpu():
-        want = Learned(case, torch.float64, HERE, texture, prefilter).draw(True, moves)
+        want = Learned(case, torch.float64, HERE, texture).draw(True, moves)
     compare(got, want, 1e-9 if dtype == torch.float64 else 1e-3)
 
 

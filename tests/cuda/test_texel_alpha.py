@@ -26,7 +26,6 @@ class Cut:
     extent: Tensor
     alpha: Tensor
     bound: float = 0.02
-    prefilter: str = "low_pass"
 
 
 def cut_scene(seed: int, count: int = 60, width: int = 50, height: int = 40, extreme: bool = False, **options) -> Cut:
@@ -51,7 +50,7 @@ def traced(cut: Cut, dtype: torch.dtype, device: torch.device, seen: str = "weig
     """Trace the fragments and compute gradients by name of a sum over the fields in `seen`."""
     leaves = {key: cut.case.params[key].to(device, dtype).clone().requires_grad_() for key in GEOMETRY}
     leaves["alpha"] = cut.alpha.to(device, dtype).clone().requires_grad_()
-    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera_of(cut.case, dtype), prefilter=cut.prefilter)
+    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera_of(cut.case, dtype))
     tiles = ops.TexelTiles.of_sizes(cut.size.to(device), cut.extent.to(device, dtype))
     fragments = ops.trace(replace(projection, alpha=ops.TexelAlpha(tiles, leaves["alpha"], cut.bound)), 1e-3)
     direction = torch.sin(fragments.pixel.double() * 0.7 + fragments.surfel.double() * 1.3).to(dtype)
@@ -74,10 +73,10 @@ def is_cut(cut: Cut, fragments: ops.Fragments) -> Tensor:
         *(cut_scene(seed, extreme=seed % 2 == 1) for seed in range(4)),
         cut_scene(4, bound=0.0),
         cut_scene(5, bound=0.0, extreme=True),
-        cut_scene(6, 30, 33, 17, extreme=True, prefilter="pixel"),
+        cut_scene(6, 30, 33, 17, extreme=True),
         cut_scene(7, 150, 20, 20, bound=0.1),
     ],
-    ids=lambda cut: f"{cut.prefilter} {cut.bound} {len(cut.size)}",
+    ids=lambda cut: f"{cut.bound} {len(cut.size)}",
 )
 def test_fragments_and_gradients_are_those_of_the_cpu(
     cut: Cut, seen: str, device: torch.device, cpu: CpuContext

@@ -53,12 +53,11 @@ def render(
     device: torch.device,
     rim: float = EXACT_RIM,
     maps: bool = True,
-    prefilter: str = "low_pass",
 ) -> Rendered:
     """Render a view, and its gradients along fixed directions for the image and for uv and depth of fragments."""
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = camera_of(case, dtype)
-    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, prefilter=prefilter)
+    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera)
     fragments = ops.trace(projection, rim)
     directions = view_directions(leaves["means"], camera.viewmat.to(device))
     base = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
@@ -116,9 +115,6 @@ def scenes() -> Iterator[Any]:
         yield pytest.param(random_scene(60, seed, width, height), {"maps": seed != 1}, {}, id=f"{width}x{height}")
     # a surfel on 95 tiles, listed by its warp and summed by its block
     yield pytest.param(random_scene(3, 0, 300, 80, scale=30.0), {}, {}, id="whole screen")
-    for scale in (0.5, 0.01):
-        case = random_scene(30, 4, 40, 24, scale=scale)
-        yield pytest.param(case, {"prefilter": "pixel"}, {"image": 1e-9, "gradient": 1e-9}, id=f"prefilter {scale}")
     for case in extreme_scenes():
         case = replace(
             case, params={key: value[:400] for key, value in case.params.items()}

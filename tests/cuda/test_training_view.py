@@ -33,11 +33,11 @@ CORRECTIONS = {
 }
 
 
-def scene_of(case: SceneCase, kind: str, texture: str, prefilter: str) -> Scene:
+def scene_of(case: SceneCase, kind: str, texture: str) -> Scene:
     """Build a float64 scene with view colours of a kind and tiles of random texels."""
     g = torch.Generator().manual_seed(4)
     n = len(case.params["means"])
-    config = SceneConfig(view_color=kind, weight_bound=0.02, near=0.2, prefilter=prefilter)
+    config = SceneConfig(view_color=kind, weight_bound=0.02, near=0.2)
     colors = VIEW_COLORS[kind].first_values(torch.rand(n, 3, generator=g) - 0.5, config, g)
     colors = {name: value + 0.3 * torch.randn(value.shape, generator=g) for name, value in colors.items()}
     params = {name: value.double() for name, value in ({name: case.params[name] for name in GEOMETRY} | colors).items()}
@@ -60,11 +60,10 @@ def compared(
     correction: str = "none",
     masked: bool = False,
     background: str = "black",
-    prefilter: str = "low_pass",
 ) -> dict[str, Tensor]:
     """Compute the losses of a view, their gradients, texels after it and the statistics of the projection."""
     case = random_scene(30, 5, WIDTH, HEIGHT)
-    scene = scene_of(case, kind, texture, prefilter).to(device)
+    scene = scene_of(case, kind, texture).to(device)
     if texture == "moved":
         scene.field.descent = TexelDescent(scene.field.share, 0.7)
     g = torch.Generator().manual_seed(7)
@@ -97,7 +96,7 @@ CASES = [
     *({"texture": texture} for texture in ("texels", "moved", "alpha", "frozen")),
     *({"correction": correction, "background": "white"} for correction in ("gains", "affine")),
     {"correction": "affine", "masked": True, "texture": "moved", "background": "random"},
-    {"masked": True, "prefilter": "pixel", "texture": "alpha", "correction": "gains"},
+    {"masked": True, "texture": "alpha", "correction": "gains"},
 ]
 
 
@@ -115,7 +114,7 @@ def test_losses_and_gradients_equal_those_of_the_cpu(case: dict[str, Any], devic
 
 def test_single_precision_is_near(device: torch.device, cpu, monkeypatch: pytest.MonkeyPatch) -> None:
     def single() -> Tensor:
-        scene = scene_of(random_scene(30, 5, WIDTH, HEIGHT), "sv", "texels", "low_pass").float().to(device)
+        scene = scene_of(random_scene(30, 5, WIDTH, HEIGHT), "sv", "texels").float().to(device)
         case = random_scene(30, 5, WIDTH, HEIGHT)
         camera = Camera(case.viewmat.float(), case.K.float(), WIDTH, HEIGHT).to(device)
         photo = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(7)).to(device)
@@ -130,7 +129,7 @@ def test_single_precision_is_near(device: torch.device, cpu, monkeypatch: pytest
 
 def test_a_view_without_surfels_or_texels_in_it(device: torch.device) -> None:
     case = random_scene(5, 5, WIDTH, HEIGHT)
-    scene = scene_of(case, "sv", "texels", "low_pass").to(device)
+    scene = scene_of(case, "sv", "texels").to(device)
     with torch.no_grad():
         scene.surfels["means"] -= 1e6 * case.viewmat[2, :3].double().to(device)  # behind the camera
     camera = Camera(case.viewmat.double(), case.K.double(), WIDTH, HEIGHT).to(device)
@@ -143,7 +142,7 @@ def test_a_view_without_surfels_or_texels_in_it(device: torch.device) -> None:
 
 def test_wrong_arguments_are_named(device: torch.device) -> None:
     case = random_scene(5, 5, WIDTH, HEIGHT)
-    scene = scene_of(case, "sv", "alpha", "low_pass").to(device)
+    scene = scene_of(case, "sv", "alpha").to(device)
     camera = Camera(case.viewmat.double(), case.K.double(), WIDTH, HEIGHT).to(device)
     photo = torch.rand(HEIGHT, WIDTH, 3).double().to(device)
 

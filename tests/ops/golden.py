@@ -125,18 +125,16 @@ def relative(a: Tensor, b: Tensor) -> float:
     return error / scale if scale > 0 else error
 
 
-def traced(
-    case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass"
-) -> tuple[ops.Fragments, ops.Projection]:
+def traced(case: SceneCase, values: Sequence[Tensor]) -> tuple[ops.Fragments, ops.Projection]:
     """Trace the fragments of a case; values: those of GEOMETRY."""
-    projection = ops.project(*values, camera_of(case, values[0].dtype), prefilter=prefilter)
+    projection = ops.project(*values, camera_of(case, values[0].dtype))
     return ops.trace(projection, 0.0), projection
 
 
-def reference(case: SceneCase, values: Sequence[Tensor], prefilter: str = "low_pass") -> reference_trace.Trace:
+def reference(case: SceneCase, values: Sequence[Tensor]) -> reference_trace.Trace:
     """Evaluate every surfel at every pixel of a case; values: those of GEOMETRY."""
     projected = reference_project.project(*values, case.viewmat, case.K)
-    return reference_trace.trace(projected, case.width, case.height, prefilter=prefilter)
+    return reference_trace.trace(projected, case.width, case.height)
 
 
 def crossing_scene(n: int, seed: int, width: int = 96, height: int = 80) -> SceneCase:

@@ -5,13 +5,14 @@ import { SURFEL_WORDS, WORD, alphaIn, layerIn, readSurfels } from '../src/bundle
 import { DamagedBundle, ViewerError } from '../src/errors';
 
 const HASH = 'a'.repeat(64);
+const RENDER = { near: 0.1, weight_bound: 0.02, background: [0, 0, 0] };
 const manifest = (changes: object = {}): string =>
   JSON.stringify({
     format: 'bitymi-bundle',
     version: '2.2',
     surfels: { count: 2, view_color: 'sv', terms: 1 },
     atlas: null,
-    render: { near: 0.1, weight_bound: 0.02, background: [0, 0, 0] },
+    render: RENDER,
     bounds: { min: [0, 0, 0], max: [2, 2, 2] },
     files: { 'surfels.ply': { bytes: 1, sha256: HASH } },
     ...changes,
@@ -78,7 +79,6 @@ describe('bundle.json', () => {
   it('is read', () => {
     const info = parseManifest(manifest());
     expect(info.count).toBe(2);
-    expect(info.prefilter).toBe('low_pass');
     expect(info.files.get('surfels.ply')?.bytes).toBe(1);
   });
   it('of a newer major version is refused, with what to do', () => {
@@ -92,6 +92,7 @@ describe('bundle.json', () => {
   it.each([
     ['not json', '{'],
     ['a number out of range', manifest({ render: { near: 0, weight_bound: 0, background: [0, 0, 0] } })],
+    ['a prefilter of its own', manifest({ render: { ...RENDER, prefilter: 'pixel' } })],
     ['a kind that is none', manifest({ surfels: { count: 1, view_color: 'xx' } })],
     ['a count that is no whole number', manifest({ surfels: { count: 1.5, view_color: 'sv' } })],
     ['files that are no objects', manifest({ files: { 'surfels.ply': 3 } })],

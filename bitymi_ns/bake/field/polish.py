@@ -56,7 +56,6 @@ def _polish_run(
         texture="texels",
         view_color=drawn.view_color,  # type: ignore[arg-type]
         weight_bound=drawn.weight_bound,
-        prefilter=drawn.prefilter,  # type: ignore[arg-type]
     )
     scene = Scene(config, drawn.surfels, TexelField(tiles.size, tiles.extent, texels.values, share), near=drawn.near)
     train = replace(

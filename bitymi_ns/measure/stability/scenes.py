@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import VIEW_COLORS, Prefilter, TexelTiles
+from bitymi_ns.ops import VIEW_COLORS, TexelTiles
 from bitymi_ns.ops.constants import SUPPORT
 
 SV_KEYS = VIEW_COLORS["sv"].names
@@ -270,10 +270,6 @@ class Way:
     name: str  # short, for tables and tests
     texels: bool = False  # each surfel has a tile of random texels; gradients reach them and, by the fetch, u and v
     alpha: bool = False  # the texels have random alphas from 0 to 2, without a weight bound
-    prefilter: Prefilter = "low_pass"  # as in `ops.project`
-    # bound of the derivative at the rim, as in `ops.trace`. With prefilter pixel the kernels bound the derivative of
-    # the averaged kernel, the reference does not: 0 disables the bound
-    rim: float = RIM
 
     def of(self, case: SceneCase) -> SceneCase:
         """Add random texels to a case if this mode has texels."""
@@ -288,11 +284,7 @@ class Way:
 
 
 PLAIN = Way("plain")
-WAYS = (
-    Way(TEXELS, texels=True),
-    Way("alpha", texels=True, alpha=True),
-    Way("pixel", prefilter="pixel", rim=0.0),
-)  # rendering modes besides PLAIN
+WAYS = (Way(TEXELS, texels=True), Way("alpha", texels=True, alpha=True))  # rendering modes besides PLAIN
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:

@@ -73,7 +73,6 @@ def render(
     residual: Callable[[Tensor], Tensor] | None = None,
     near: float = 0.2,
     rim: float = 0.0,
-    prefilter: str = "low_pass",
 ) -> Render:
     """Render surfels. Colour of a fragment: ReLU(f_view + 0.5), with texture ReLU(that + texture).
 
@@ -85,13 +84,13 @@ def render(
         tiles: a texture tile [r_v, r_u, 3] per surfel, or [r_v, r_u, 4] with factors of sigma.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
         near: see `project`.
-        rim, prefilter: see `trace`.
+        rim: see `trace`.
     """
     width, height = camera.width, camera.height
     p = project(*geometry, camera.viewmat, camera.K, near)
     alphas = tiles is not None and any(tile.shape[-1] == 4 for tile in tiles)
     factor = (lambda uv, where: fetched(tiles, uv, where)[..., 3]) if alphas else None
-    t = trace(p, width, height, near, rim, prefilter, factor=factor)
+    t = trace(p, width, height, near, rim, factor=factor)
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]
     if tiles is not None:

@@ -43,46 +43,10 @@ def _power(base: Tensor, exponent: Tensor, floor: float) -> Tensor:
     return torch.exp(exponent * (fixed.log() + (base - fixed) / fixed.clamp(min=floor)))
 
 
-PIXEL_VARIANCE = 0.25  # pixels^2, along each axis
-
-
 def _jacobian(projection: Projection) -> tuple[Tensor, Tensor]:
     """Compute J = d pixel / d (u, v) at the centre [N, 2, 2], and its depth [N], 1 if the surfel is not valid."""
     M, z = projection.M, torch.where(projection.valid, projection.depth, 1.0)
     return (M[:, :2, :2] - projection.mean2d[:, :, None] * M[:, 2:, :2]) / z[:, None, None], z
-
-
-def _filtered(projection: Projection, pixels: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute kernel times area share [P, N], uv [P, N, 2] and depth [P, N] with the prefilter (docs/numerics.md).
-
-    J = d pixel / d (u, v) at the centre; at a pixel with offset d the affine coordinate is a = J^-1 d, and the disc's
-    perspective there is omega = z / depth = 1 - e.a, with the disc's depth z (1 + e.(u, v)). Outside of the disc's
-    image, omega is taken at the rim in the direction of a. Then Sigma = omega^2 J J^T + c, c = 2 (beta + 2) / 9 / 4.
-    """
-    J, z = _jacobian(projection)
-    area = torch.linalg.det(J)
-    flat = area == 0  # exactly edge-on
-    safe = torch.where((flat | ~projection.valid)[:, None, None], torch.eye(2, dtype=J.dtype), J)
-    d = pixels[:, None] - projection.mean2d  # [P, N, 2]
-    a = torch.linalg.solve(safe, d[..., None])[..., 0]
-    e = projection.M[:, 2, :2] / z[:, None]  # [N, 2]
-    tilt = (a * e).sum(-1)  # [P, N]
-    length = torch.where(
-        (a == 0).all(-1), 0.0, (torch.where((a == 0).all(-1, keepdim=True), 1.0, a) ** 2).sum(-1).sqrt()
-    )
-    outside = length > SUPPORT * (1 - tilt)
-    omega = torch.where(outside, length / torch.where(outside, length + SUPPORT * tilt, 1.0), 1 - tilt)
-    sigma = safe @ safe.transpose(-1, -2)
-    blur = 2 * (projection.beta + 2) / SUPPORT**2 * PIXEL_VARIANCE
-    wide = omega[..., None, None] ** 2 * sigma + blur[:, None, None] * torch.eye(2, dtype=J.dtype)  # [P, N, 2, 2]
-    det = wide[..., 0, 0] * wide[..., 1, 1] - wide[..., 0, 1] ** 2
-    x, y = d.unbind(-1)
-    q = (wide[..., 1, 1] * x * x - 2 * wide[..., 0, 1] * x * y + wide[..., 0, 0] * y * y) / det
-    depth = projection.depth / omega
-    rest = 1 - q / SUPPORT**2
-    inside = (rest > 0) & (depth > near) & ~flat
-    kernel = torch.where(inside, torch.where(inside, rest, 1.0) ** projection.beta, 0.0)
-    return kernel * omega**2 * area.abs() / det.sqrt(), (a / omega[..., None]).clamp(-SUPPORT, SUPPORT), depth
 
 
 def _resized(projection: Projection, photo_pixel: float) -> tuple[Tensor, Tensor, float, float]:
@@ -110,7 +74,6 @@ def trace(
     height: int,
     near: float = 0.2,
     rim: float = 0.0,
-    prefilter: str = "low_pass",
     photo_pixel: float = 1.0,
     factor: Callable[[Tensor, Tensor], Tensor] | None = None,
 ) -> Trace:
@@ -123,8 +86,7 @@ def trace(
     A fragment is skipped if sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
     centres' depths (equal depths: by index); the one that would reduce the transmittance below 1e-4 is not blended and
     ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative only, as in the compiled kernels.
-    With the prefilter `pixel`, G is the kernel averaged over a pixel instead (`_filtered`), without `rim`.
-    Without it, `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`). Sigma is
+    `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`). Sigma is
     multiplied by `factor`, up to 0.99: [P, N] from uv [P, N, 2] and a mask of needed entries [P, N].
     """
     pixels = pixel_centers(width, height)  # [P, 2]
@@ -148,9 +110,6 @@ def trace(
     if photo_pixel != 1:
         kernel, blur = share * kernel, blur_share * blur ** (1 / radius2)
     low_pass = blur > kernel
-    if prefilter == "pixel":
-        kernel, uv, depth = _filtered(projection, pixels, near)
-        low_pass = torch.zeros_like(low_pass)
     sigma = (projection.opacity * torch.where(low_pass, blur, kernel)).clamp(max=ALPHA_MAX)
 
     covered = projection.valid & (sigma >= ALPHA_MIN)

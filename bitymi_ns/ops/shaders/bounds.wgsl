@@ -117,7 +117,7 @@ fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
 
 fn rectangle(s: Seen) -> Rectangle {
   let ratio = s.opacity / ALPHA_MIN;
-  let blurred = -s.area * ratio;  // maximum of the low pass over ALPHA_MIN
+  let blurred = s.low_pass * ratio;  // maximum of the low pass over ALPHA_MIN
   let almost = 1.0 - 1e-6;
   if max(ratio, blurred) < almost { return hidden(); }
   let r2 = level_radius2(log(max(ratio, 1.0)) + 1e-5, s.beta);
@@ -126,7 +126,7 @@ fn rectangle(s: Seen) -> Rectangle {
   let change = LOW_PASS_REACH * sqrt(blur2) * (abs(s.w.x) + abs(s.w.y));
   let least = s.w0 - change;
   let slope = dot(s.u, s.u) + dot(s.v, s.v);
-  let covered = -s.area <= 1.0 && least > 0.0 && s.w0 * s.z > frame.near * (s.w0 + change)
+  let covered = s.low_pass <= 1.0 && least > 0.0 && s.w0 * s.z > frame.near * (s.w0 + change)
     && SUPPORT2 * least * least >= (s.beta + LOW_PASS_REACH * LOW_PASS_REACH) * blur2 * 1.001 * slope;
   var blur = 0.0;
   if !covered && blurred >= almost { blur = sqrt((log(max(blurred, 1.0)) + 1e-5) * blur2) + 0.01; }
@@ -156,33 +156,6 @@ fn rectangle(s: Seen) -> Rectangle {
   let cut = clipped(s, p, q, c, blur);
   if !cut.visible || cut.half_size.x * cut.half_size.y < r.half_size.x * r.half_size.y { return cut; }
   return r;
-}
-
-fn filter_variance(beta: f32) -> f32 {
-  return PIXEL_VARIANCE * 2.0 / SUPPORT2 * (beta + 2.0);
-}
-
-// Bounds the prefiltered kernel: the ellipse of the largest blur and magnification at any pixel (core/bounds.h).
-fn filtered_rectangle(s: Seen) -> Rectangle {
-  let ratio = s.opacity / ALPHA_MIN;
-  if !(s.w0 > 0.0) || !(ratio > 1.0) { return hidden(); }
-  let c = filter_variance(s.beta);
-  let e = vec2f(s.w.x * s.v.y - s.w.y * s.v.x, s.u.x * s.w.y - s.u.y * s.w.x);
-  let eta = SUPPORT * length(e) * s.area / s.w0 * 1.001;
-  if !(eta < 0.9) { return screen(); }
-  let w = 1.0 / (1.0 - eta);
-  let p = w * s.area * vec2f(s.u.y, -s.u.x);
-  let q = w * s.area * vec2f(s.v.y, -s.v.x);
-  let area = w * w * s.area * s.w0;
-  let det = area * area + c * (dot(p, p) + dot(q, q) + c);
-  let level = log(ratio * area / sqrt(det)) + 1e-4;
-  if !(level >= 0.0) { return hidden(); }
-  let r2 = level_radius2(level, s.beta);
-  let axis = major_axis(p, q);
-  let other = vec2f(-axis.y, axis.x);
-  let along = sqrt(r2 * (dot(axis, p) * dot(axis, p) + dot(axis, q) * dot(axis, q) + c)) * 1.001;
-  let across = sqrt(r2 * (dot(other, p) * dot(other, p) + dot(other, q) * dot(other, q) + c)) * 1.001;
-  return finish(s.center, axis, -vec2f(along, across), vec2f(along, across));
 }
 
 // Returns true if the rectangle meets the image.

@@ -21,7 +21,7 @@ struct Corner {
   @location(0) @interpolate(flat) center_u: vec4f,
   @location(1) @interpolate(flat) v_w: vec4f,
   @location(2) @interpolate(flat) w0_z_opacity_beta: vec4f,
-  @location(3) @interpolate(flat) color_area: vec4f,
+  @location(3) @interpolate(flat) color_low_pass: vec4f,
   @location(4) @interpolate(flat) tile: vec4f,  // first texel, span; without a tile residual and alpha
   @location(5) @interpolate(flat) texel: vec4f,  // layer, -1 without a tile; 1 / (2 extent); normal z; level
 }
@@ -40,7 +40,7 @@ fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance:
   out.center_u = vec4f(s.center, s.u);
   out.v_w = vec4f(s.v, s.w);
   out.w0_z_opacity_beta = vec4f(s.w0, s.z, s.opacity, s.beta);
-  out.color_area = vec4f(s.color, s.area);
+  out.color_low_pass = vec4f(s.color, s.low_pass);
   if s.level == TILE_LEVELS {
     out.tile = vec4f(surfel.residual, f32(surfel.layer >> 24) / 128.0);
     out.texel = vec4f(-1.0, 0.0, s.normal_z, 0.0);
@@ -69,39 +69,11 @@ fn beta_fragment(c: Corner, d: vec2f) -> Fragment {
   let rest = 1.0 - dot(at, at) / SUPPORT2;
   let inside = hit && rest > 0.0;
   let kernel = select(0.0, exp2(c.w0_z_opacity_beta.w * log2(select(1.0, rest, inside))), inside);
-  let blur = -c.color_area.w * exp(-dot(d, d) * low_pass_sharp());
+  let blur = c.color_low_pass.w * exp(-dot(d, d) * low_pass_sharp());
   var f: Fragment;
   f.at = clamp(at, vec2f(-SUPPORT), vec2f(SUPPORT));
   f.depth = select(w0 * z * inverse, z, blur > kernel);
   f.sigma = min(ALPHA_MAX, c.w0_z_opacity_beta.z * max(kernel, blur));
-  return f;
-}
-
-// core/prefilter.h
-fn filtered_fragment(c: Corner, d: vec2f) -> Fragment {
-  let w0 = c.w0_z_opacity_beta.x;
-  let z = c.w0_z_opacity_beta.y;
-  let beta = c.w0_z_opacity_beta.w;
-  let n = c.color_area.w;
-  let variance = PIXEL_VARIANCE * 2.0 / SUPPORT2 * (beta + 2.0);
-  let a = n * vec4f(c.center_u.zw, c.v_w.xy);
-  let spread = dot(a, a);
-  let tilt = dot(c.v_w.zw, d);
-  let uv = vec2f(dot(c.center_u.zw, d), dot(c.v_w.xy, d));
-  let r = length(uv);
-  let outside = r > SUPPORT * (w0 + tilt);
-  let omega = select(w0 + tilt, r, outside) / select(w0, r - SUPPORT * tilt, outside);
-  let w2 = omega * omega;
-  let covered = w2 * n * w0;
-  let denominator = covered * covered + (variance * spread * w2 + variance * variance);
-  let q = (w2 * dot(n * uv, n * uv) + variance * dot(d, d)) / denominator;
-  let rest = 1.0 - q / SUPPORT2;
-  let inside = rest > 0.0 && z > frame.near * omega;
-  let kernel = select(0.0, exp2(beta * log2(select(1.0, rest, inside))), inside);
-  var f: Fragment;
-  f.at = clamp(uv / (w0 * omega), vec2f(-SUPPORT), vec2f(SUPPORT));
-  f.depth = z / omega;
-  f.sigma = min(ALPHA_MAX, c.w0_z_opacity_beta.z * covered / sqrt(denominator) * kernel);
   return f;
 }
 
@@ -124,8 +96,7 @@ fn texels(c: Corner, at: vec2f) -> vec4f {
 @fragment
 fn surfel(c: Corner) -> @location(0) vec4f {
   let d = c.position.xy - c.center_u.xy;
-  var f: Fragment;
-  if c.color_area.w > 0.0 { f = filtered_fragment(c, d); } else { f = beta_fragment(c, d); }
+  var f = beta_fragment(c, d);
   if f.sigma < ALPHA_MIN { discard; }
   var front = 1.0;
   if layer.x > 0 { front = textureLoad(before, vec2i(c.position.xy), 0).a; }
@@ -152,7 +123,7 @@ fn surfel(c: Corner) -> @location(0) vec4f {
       return vec4f(f.sigma * max(shift + 0.5, vec3f(0.0)), f.sigma);
     }
     default: {
-      var color = c.color_area.xyz;
+      var color = c.color_low_pass.xyz;
       if textured { color = max(color + texel.rgb, vec3f(0.0)); }
       return vec4f(f.sigma * color, f.sigma);
     }

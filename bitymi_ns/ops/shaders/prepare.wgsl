@@ -50,13 +50,10 @@ fn prepare(@builtin(global_invocation_id) id: vec3u) {
   s.opacity = sigmoid(surfel.opacity_logit);
   s.beta = BETA_MAX * sigmoid(surfel.beta_raw);
   s.normal_z = -turn * n.z;
-  let area = frame.lens.x * frame.lens.y * scales.x * scales.y * iz * iz;
-  s.area = select(0.0, area, frame.prefilter != 0 && area < 1e12);
-  if !(s.area > 0.0) { s = resized(s); }
-  if !finite(vec4f(s.center, s.w0, s.area)) || !finite(vec4f(s.opacity)) || !finite(vec4f(s.u, s.v)) { return; }
+  s = resized(s);
+  if !finite(vec4f(s.center, s.w0, s.low_pass)) || !finite(vec4f(s.opacity)) || !finite(vec4f(s.u, s.v)) { return; }
 
-  var r: Rectangle;
-  if s.area > 0.0 { r = filtered_rectangle(s); } else { r = rectangle(s); }
+  let r = rectangle(s);
   if !on_screen(r) { return; }
   s.axis = r.axis;
   s.middle = r.middle;

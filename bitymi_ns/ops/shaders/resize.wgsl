@@ -1,28 +1,24 @@
 // Adaptation of surfels to views of another size than the training photographs, as core/resize.h and core/texel.h.
 
-// Returns the side of a photograph's pixel for the kernels; 1 with the pixel prefilter, which adapts itself.
-fn kernel_pixel() -> f32 {
-  return select(frame.photo_pixel, 1.0, frame.prefilter != 0);
-}
 // Computes the variance that a pixel adds along each axis, pixels^2.
 fn pixel_variance() -> f32 {
-  let p = kernel_pixel();
+  let p = frame.photo_pixel;
   return max(0.0, (1.0 - p * p) / 12.0);
 }
 // Computes 1 / squared radius of the low pass.
 fn low_pass_sharp() -> f32 {
-  let p = kernel_pixel();
+  let p = frame.photo_pixel;
   return 1.0 / (p * p + 2.0 * pixel_variance());
 }
 
-// Widens the surfel by the pixel and its low pass by the view's size; `area` then holds the height of the low pass over
-// that of the kernel, negated.
+// Widens the surfel by the pixel and its low pass by the view's size; `low_pass` then holds the height of the low pass
+// over that of the kernel.
 fn resized(seen: Seen) -> Seen {
   var s = seen;
   let variance = pixel_variance();
-  let p = kernel_pixel();
+  let p = frame.photo_pixel;
   let share = p * p * low_pass_sharp();
-  s.area = -share;
+  s.low_pass = share;
   if variance == 0.0 || !(s.w0 > 0.0) { return s; }
   // M' = (1 + c M M^T)^(-1/2) M, from positive terms only
   let c = variance * 2.0 / SUPPORT2 * (s.beta + 2.0);
@@ -38,7 +34,7 @@ fn resized(seen: Seen) -> Seen {
   s.u = inverse.x * seen.u + inverse.y * seen.v;
   s.v = inverse.y * seen.u + inverse.z * seen.v;
   s.opacity = seen.opacity / root;
-  s.area = -share * root;
+  s.low_pass = share * root;
   return s;
 }
 

@@ -12,7 +12,6 @@ const LOW_PASS_REACH: f32 = 2.36;
 const BETA_MAX: f32 = 4.0;
 const LOG_SCALE_MAX: f32 = 30.0;
 const COLOR_BIAS: f32 = 0.5;
-const PIXEL_VARIANCE: f32 = 0.25;
 
 // A stored surfel, 96 bytes; means are relative to the scene's origin.
 struct Surfel {
@@ -42,7 +41,7 @@ struct Seen {
   opacity: f32,
   beta: f32,
   color: vec3f,  // relu(f_view + 0.5)
-  area: f32,  // > 0 with the pixel prefilter; else minus the height of the low pass over that of the kernel
+  low_pass: f32,  // its height over that of the kernel
   axis: vec2f,  // unit vector along the bounding rectangle
   middle: vec2f,  // of the rectangle, pixels
   half_size: vec2f,  // along the axis and across
@@ -65,7 +64,6 @@ struct Frame {
   atlas: vec2f,  // size of a page, texels
   surfels: u32,
   kind: u32,  // of the view colours, VIEW_*
-  prefilter: u32,
   layers: u32,  // batches of surfels, drawn in sequence
   show: u32,  // SHOW_*
   residuals: u32,  // 1: add residuals

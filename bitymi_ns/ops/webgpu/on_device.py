@@ -70,7 +70,6 @@ class SceneOnDevice:
         self.count = len(packed.surfels)
         check_room(max(packed.surfels.nbytes, packed.terms.nbytes), -(-self.count // 64), (1, 1))
         self._near, self._bound = scene.near, scene.weight_bound
-        self._prefilter = scene.prefilter == "pixel"
         self._offset, self._scale, self._alpha_scale = scene.offset, scene.scale, scene.alpha_scale
         flags = library().BufferUsage
         storage, n = flags.STORAGE, max(1, self.count)
@@ -239,13 +238,13 @@ class SceneOnDevice:
         center = camera.exact_center.cpu().double().numpy() - self._origin
         rows = [(*viewmat[k, :3], 0.0) for k in range(3)]
         data = struct.pack(
-            "<32f6IfI",
+            "<32f5IfI4x",
             *(value for row in rows for value in row),
             *(*center, self._alpha_scale, *center, 1.0),
             *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
             *(camera.width, camera.height, self._near, self._bound),
             *(self._offset, self._scale, *self._atlas_size),
-            *(self.count, self._kind, int(self._prefilter), layers),
+            *(self.count, self._kind, layers),
             *(SHOW[show], 1, photo_pixel, self._detail),
         )
         self._device.queue.write_buffer(self._frame, 0, data)
@@ -345,7 +344,7 @@ def draw(
     texels = (scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual, scene.mean_alpha)
     sources = (*scene.surfels.values(), *texels)
     scales = f"{scene.offset} {scene.scale} {scene.alpha_scale}"
-    numbers = f"webgpu {scene.near} {scene.weight_bound} {scales} {scene.prefilter}"
+    numbers = f"webgpu {scene.near} {scene.weight_bound} {scales}"
     there = scene.cache.atlas(lambda: SceneOnDevice(scene), *sources, numbers)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:

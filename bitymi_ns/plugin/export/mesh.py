@@ -21,7 +21,7 @@ from bitymi_ns.interchange import Frame, training_cameras
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
 from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes
-from bitymi_ns.ops import Prefilter, TexelAlpha
+from bitymi_ns.ops import TexelAlpha
 from bitymi_ns.plugin.console import InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.export.trained import load_trained, world_of
@@ -40,7 +40,6 @@ class MeshScene(NamedTuple):
     render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
     cameras: Sequence[Camera]  # of the training views
     near: float  # nearest drawn depth, camera z
-    prefilter: Prefilter  # as in `ops.project`
     world: WorldEntry  # transform from the capture's frame to the scene's
     alpha: TexelAlpha | None  # opacities of the texels; None = opaque
 
@@ -89,7 +88,7 @@ class ExportMesh(SurfaceOptions):
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]
         with rich_progress() as progress:
-            drawn = (cameras, source.near, self, source.prefilter, progress, source.alpha, to)
+            drawn = (cameras, source.near, self, progress, source.alpha, to)
             mesh = extract_surface(source.surfels, source.render, *drawn)
         note = "" if to is None else to.note
         up, origin = up_of(source.world, to), torch.zeros(3) if to is None else to.origin
@@ -115,7 +114,7 @@ def from_run(load_config: Path) -> MeshScene:
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     world = WorldEntry.model_validate_json(json.dumps(plain(world_of(datamanager).described())))
     alpha = None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False)
-    drawn = (cameras, scene.near, scene.config.prefilter, world, alpha)
+    drawn = (cameras, scene.near, world, alpha)
     return MeshScene(surfels, lambda camera: model.render(camera, model.background, maps=False).rgb, *drawn)
 
 
@@ -130,5 +129,5 @@ def from_bundle(folder: Path, crop: bool = False) -> MeshScene:
     if not cameras:
         advice = "give the config.yml of the run that it was made from"
         raise BundleError(f"{folder} has no cameras ({CAMERAS}) to see the surface from: {advice}")
-    drawn = (cameras, scene.near, scene.prefilter, bundle.info.world, texel_alpha(scene))
+    drawn = (cameras, scene.near, bundle.info.world, texel_alpha(scene))
     return MeshScene(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)

@@ -204,6 +204,7 @@ class BitymiTrainerConfig(TrainerConfig):
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
             run = Path(os.path.expanduser(checkpoints_of)).absolute().parent
+            run_folder.check_options(run)
             self.take_poses_of(run)
             dataparser = self.pipeline.datamanager.dataparser
             poses = getattr(dataparser, "poses", None)

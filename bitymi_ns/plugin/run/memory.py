@@ -54,7 +54,7 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
         geometry = (p[name].cpu() for name in GEOMETRY)
-        most = max(most, count(project(*geometry, camera, scene.near, scene.config.prefilter)))
+        most = max(most, count(project(*geometry, camera, scene.near)))
     device = p["means"].device
     capacity = int(free_memory(device)) // PER_CARD_FRAGMENT if device.type == "cuda" else MOST
     return min(int(MARGIN * most), bound or capacity)

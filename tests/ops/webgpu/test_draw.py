@@ -63,11 +63,10 @@ def test_golden_scenes(name: str) -> None:
     assert (got.rgb.double() - golden.outputs["rgb"]).abs().max() < STEP
 
 
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("case", EXTREME, ids=[case.name for case in EXTREME])
-def test_numbers_that_misbehave(case: SceneCase, prefilter: str) -> None:
+def test_numbers_that_misbehave(case: SceneCase) -> None:
     case = replace(case, width=min(case.width, 300), height=min(case.height, 300))
-    check(scene_of(case, prefilter=prefilter), camera_of(case), case.background.float(), PICTURE)
+    check(scene_of(case), camera_of(case), case.background.float(), PICTURE)
 
 
 def rectangles(scene: on_device.SceneOnDevice) -> NDArray[np.float32]:
@@ -127,10 +126,9 @@ def test_view_colours(kind: str, lean: bool) -> None:
     assert check(scene, front()).mean() < 0.1 * STEP
 
 
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
-def test_texels_are_fetched_within_their_tile(prefilter: str) -> None:
+def test_texels_are_fetched_within_their_tile() -> None:
     for dtype in (torch.uint8, torch.float32):
-        scene = replace(textured(60, 0, dtype), weight_bound=0.0, prefilter=prefilter)
+        scene = replace(textured(60, 0, dtype), weight_bound=0.0)
         # a texture unit's weights have 8 fractional bits
         assert check(scene, front(), torch.tensor([0.2, 0.4, 0.6])).max() < 2 * STEP
 
@@ -141,10 +139,9 @@ def cutting(scene: BakedScene) -> BakedScene:
     return replace(scene, alpha_scale=255 / 128, mean_alpha=mean, weight_bound=0.0)
 
 
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
-def test_alpha_texels_cut_surfels(dtype: torch.dtype, prefilter: str) -> None:
-    scene = replace(cutting(textured(60, 0, dtype)), prefilter=prefilter)
+def test_alpha_texels_cut_surfels(dtype: torch.dtype) -> None:
+    scene = cutting(textured(60, 0, dtype))
     assert check(scene, front(), torch.tensor([0.2, 0.4, 0.6])).max() < 2 * STEP
     opaque = replace(scene, alpha_scale=0.0, mean_alpha=None)
     assert (scene.render(front()).alpha - opaque.render(front()).alpha).abs().mean() > 0.01
@@ -238,13 +235,12 @@ def photographed(scene: BakedScene, camera: Camera) -> BakedScene:
 
 
 @pytest.mark.parametrize("alpha", [False, True])
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
 @pytest.mark.parametrize("share", [2.0, 0.5, 0.12])
-def test_views_of_other_sizes(share: float, prefilter: str, alpha: bool) -> None:
+def test_views_of_other_sizes(share: float, alpha: bool) -> None:
     camera = front(240, 176)
     camera.K[:2, :2] *= 2.0
     for dtype in (torch.uint8, torch.float32):
-        scene = photographed(replace(textured(300, 3, dtype), prefilter=prefilter), camera)
+        scene = photographed(textured(300, 3, dtype), camera)
         scene = cutting(scene) if alpha else scene
         off = check(scene, camera.scaled(share), torch.tensor([0.2, 0.4, 0.6]), ("rgb", "alpha", "depth"))
         assert off.mean() < 0.1 * STEP and off.max() < 2 * STEP, (off.mean() / STEP, off.max() / STEP)

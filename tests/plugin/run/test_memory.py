@@ -226,9 +226,7 @@ def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: pytest.Mo
     surfels["beta_raw"] = torch.zeros(count)
     camera = Camera(torch.eye(4), torch.tensor([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]]), size, size)
     bound = 0.0471 * 0.953**16.5  # between the weights of two fragments, so that 43 % show a texel
-    stands = SimpleNamespace(
-        surfels=surfels, near=0.2, config=SimpleNamespace(weight_bound=bound, prefilter="low_pass")
-    )
+    stands = SimpleNamespace(surfels=surfels, near=0.2, config=SimpleNamespace(weight_bound=bound))
     tiles = Tiles(torch.full((count, 2), 4), torch.full((count,), 3.0), torch.zeros(16 * count, 3))
     baked = BakeState.of(stands, surfels, torch.arange(count), tiles, BakeOptions(format="fp16"))
     view = View(camera, torch.zeros(size, size, 3))

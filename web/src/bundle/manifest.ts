@@ -47,7 +47,6 @@ export interface Manifest {
   atlas: Atlas | null;
   near: number;
   weightBound: number;
-  prefilter: 'low_pass' | 'pixel';
   photographed: Float32Array | null; // rows x, y, z, pixels per unit of length
   background: Vec3;
   bounds: { min: Vec3; max: Vec3 };
@@ -243,6 +242,7 @@ export function parseManifest(text: string): Manifest {
   if (!coded && Boolean(texture?.alphaScale) !== (major === 4)) {
     throw new DamagedBundle('bundle.json: atlas.alpha_scale must be stated in version 4, and in no earlier one.');
   }
+  if (render.has('prefilter')) render.choice('prefilter', ['low_pass']); // others are drawn no longer
   return {
     version,
     count: surfels.whole('count', 0, 2 ** 28),
@@ -252,7 +252,6 @@ export function parseManifest(text: string): Manifest {
     atlas: texture,
     near: render.number('near', 1e-9, 1e6),
     weightBound: render.number('weight_bound', 0, 1),
-    prefilter: render.has('prefilter') ? render.choice('prefilter', ['low_pass', 'pixel']) : 'low_pass',
     photographed: render.has('photographed') ? points(render) : null,
     background: render.point('background', 1),
     bounds: { min: bounds.point('min', 1e9), max: bounds.point('max', 1e9) },

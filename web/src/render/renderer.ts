@@ -119,10 +119,9 @@ export class Renderer {
     f.set([view.fx, view.fy, view.cx, view.cy], 20);
     f.set([width, height, info.near, info.weightBound], 24);
     f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], 28);
-    u.set([count, surfels.kind, info.prefilter === 'pixel' ? 1 : 0, options.layers], 32);
-    u.set([SHOW[options.show], options.residuals ? 1 : 0], 36);
-    f[38] = photoPixel;
-    u[39] = this.scene.detail;
+    u.set([count, surfels.kind, options.layers, SHOW[options.show], options.residuals ? 1 : 0], 32);
+    f[37] = photoPixel;
+    u[38] = this.scene.detail;
     this.graphics.device.queue.writeBuffer(this.scene.frame, 0, data);
   }
 

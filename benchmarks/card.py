@@ -20,7 +20,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 CARRIED = ("bitymi_ns", "benchmarks", "tests", "method_configs", "pyproject.toml", "csrc", "docs", "README.md")
 NEEDED = ("ispc_texcomp", "pydantic", "flip-evaluator", "torchmetrics", "lightning-utilities", "typing-extensions")
-NEEDED += ("zstandard", "wgpu", "cffi", "pycparser", "rendercanvas")
+NEEDED += ("wgpu", "cffi", "pycparser", "rendercanvas")
 NEEDED += ("nerfstudio", "viser", "websockets", "msgspec", "trimesh", "tyro", "docstring-parser", "typeguard")
 NEEDED += ("appdirs", "mediapy", "pyquaternion", "pytorch-msssim", "splines", "pycolmap", "nerfacc")
 """Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt.

@@ -10,7 +10,6 @@ from torch import Tensor
 
 from bitymi_ns.bake.state import BakeState
 from bitymi_ns.bake.tiles import TileVisibility, weighted_rms, weights
-from bitymi_ns.bundle.sketch import sketches_text
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.codec.pages import first_texels, listed_texels, listed_tiles
 from bitymi_ns.codec.quantise import STEPS
@@ -120,7 +119,5 @@ def certified(baked: BakeState, cameras: Sequence[Camera]) -> BakeState:
     shown = TileVisibility(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
     errors, seen = listed_errors(stored - before, baked.sizes, shown)
     rms = STEPS * float((stored - before).double().square().mean().sqrt())
-    certificate = Certificate.of(errors[seen], options.tolerance).replace(
-        texel_rms=round(rms, 4), marks=sketches_text(before, stored)
-    )
+    certificate = Certificate.of(errors[seen], options.tolerance).replace(texel_rms=round(rms, 4))
     return replace(baked, statistics=baked.statistics.replace(certificate=certificate))

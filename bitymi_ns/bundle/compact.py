@@ -1,19 +1,26 @@
-"""surfels.bin and texels.bin of a compact bundle: integer columns described by bundle.json."""
+"""surfels.bin and texels.bin of a compact bundle: integer columns described by bundle.json. A `digest` takes their
+integers, little-endian int64 in order, for `Manifest.decoded`."""
 
+from __future__ import annotations
+
+import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import COMPACT_SURFELS, AtlasEntry, ColumnEntry, Surfels
+from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, AtlasEntry, ColumnEntry, Manifest, Surfels
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.streams import StreamError
 from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, Codes, PositionGrid, SurfelCodes, term_numbers
 from bitymi_ns.codec.texel_codes import GRADES, AlphaCodes, TexelCodes, blocks_of, coefficient_columns
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
+
+if TYPE_CHECKING:
+    from hashlib import _Hash as Digest
 
 SURFELS_PER_BYTE, TEXELS_PER_BYTE = 1, 64
 """Upper bounds, plus `SPARE_*`, on what a file may claim: constant columns take no bytes on disk, but memory. Trained
@@ -25,7 +32,7 @@ _MOST_COEFFICIENT = 1 << 24
 
 
 def encode_surfels(
-    codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None = None
+    codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None, digest: Digest
 ) -> tuple[dict[str, Any], bytes]:
     """Encode surfels.bin; returns its entries in bundle.json and its bytes.
 
@@ -39,13 +46,13 @@ def encode_surfels(
         columns["alpha"] = alpha[:, None]
     steps = {**codes.steps, "residual": residual_step}
     names = _surfel_columns(codes.kind, alpha is not None)[0]
-    described, data = _compressed({name: columns[name] for name in names}, steps)
+    described, data = _compressed({name: columns[name] for name in names}, steps, digest)
     frame = {"center": codes.frame.center, "scale": codes.frame.scale, "low": codes.frame.low}
     return {"frame": frame, "columns": described}, data
 
 
 def decode_surfels(
-    info: Surfels, data: memoryview, has_alpha: bool = False
+    info: Surfels, data: memoryview, has_alpha: bool = False, digest: Digest | None = None
 ) -> tuple[SurfelCodes, Codes, float, Codes | None]:
     """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] if it has them.
 
@@ -60,7 +67,7 @@ def decode_surfels(
     for column, part in zip(info.columns, _parts(data, info.columns), strict=True):
         if column.name == "extent":
             rows["extent"] = int((codes["size"] > 0).sum())
-        codes[column.name] = _decompressed(part, rows[column.name], column)
+        codes[column.name] = _decompressed(part, rows[column.name], column, digest)
         _check_codes(column.name, codes[column.name], info)
     codes["place"] = np.cumsum(codes["place"], axis=0)
     f, residual = info.frame, codes.pop("residual")
@@ -70,32 +77,52 @@ def decode_surfels(
     return SurfelCodes(info.view_color, frame, steps, codes), residual, residual_step, alpha
 
 
-def encode_texels(codes: TexelCodes) -> tuple[dict[str, Any], bytes]:
+def encode_texels(codes: TexelCodes, digest: Digest) -> tuple[dict[str, Any], bytes]:
     """Encode texels.bin; returns its entries in bundle.json and its bytes."""
     columns, alpha = codes.columns, codes.alpha
     steps = {} if alpha is None else {name: alpha.step for name in columns if name.startswith("alpha_")}
-    described, data = _compressed(columns, steps)
+    described, data = _compressed(columns, steps, digest)
     count = int(codes.sizes.clamp(min=1).prod(dim=1)[codes.sizes[:, 0] > 0].sum())
     return {"texels": count, "step": codes.step, "columns": described}, data
 
 
-def _compressed(columns: Mapping[str, Codes], steps: Mapping[str, float]) -> tuple[list[dict[str, Any]], bytes]:
+def decoded_hash(info: Manifest, files: Mapping[str, bytes | bytearray]) -> str:
+    """Compute `Manifest.decoded` of the files of a compact bundle, as this machine decodes them."""
+    digest = hashlib.sha256()
+    data = memoryview(files[COMPACT_SURFELS])
+    codes, residual, step, alpha = decode_surfels(info.surfels, data, info.has_alpha, digest)
+    if info.atlas is not None:
+        sizes, data = torch.from_numpy(codes.sizes), memoryview(files[TEXELS])
+        decode_texels(info.atlas, sizes, residual, step, data, alpha, digest)
+    return digest.hexdigest()
+
+
+def _compressed(
+    columns: Mapping[str, Codes], steps: Mapping[str, float], digest: Digest
+) -> tuple[list[dict[str, Any]], bytes]:
     """Compress columns; returns their entries in bundle.json and the bytes."""
+    for values in columns.values():
+        digest.update(np.ascontiguousarray(values, "<i8"))
     found = {name: streams.compress(values) for name, values in columns.items()}
     entries = [{"name": name, "step": steps.get(name), "bytes": c.sizes} for name, c in found.items()]
     return entries, b"".join(c.data for c in found.values())
 
 
-def _decompressed(data: memoryview, rows: int, column: ColumnEntry, blocks: int = 0) -> Codes:
-    """Decompress a column of any version."""
-    if column.bytes is not None:
-        return streams.decompress(data, rows, column.bytes, blocks)
-    assert column.low is not None and column.planes is not None
-    return streams.decompress_planes(data, rows, column.low, column.planes)
+def _decompressed(data: memoryview, rows: int, column: ColumnEntry, digest: Digest | None, blocks: int = 0) -> Codes:
+    codes = streams.decompress(data, rows, column.bytes, blocks)
+    if digest is not None:
+        digest.update(np.ascontiguousarray(codes, "<i8"))
+    return codes
 
 
 def decode_texels(
-    info: AtlasEntry, sizes: Tensor, residual: Codes, residual_step: float, data: memoryview, alpha: Codes | None = None
+    info: AtlasEntry,
+    sizes: Tensor,
+    residual: Codes,
+    residual_step: float,
+    data: memoryview,
+    alpha: Codes | None = None,
+    digest: Digest | None = None,
 ) -> TexelCodes:
     """Decode texels.bin.
 
@@ -120,12 +147,12 @@ def decode_texels(
         raise StreamError("the columns of alphas have different steps")
     parts = _parts(data, info.columns)
     column, tiles = info.columns[0], int((sizes[:, 0] > 0).sum())
-    grades = _decompressed(next(parts), tiles, column)[:, 0]
+    grades = _decompressed(next(parts), tiles, column, digest)[:, 0]
     if tiles and not (GRADES[0] <= grades.min() and grades.max() <= GRADES[1]):
         raise StreamError(f"a grade is not from {GRADES[0]} to {GRADES[1]}")
     coefficients = []
     for each, column, part in zip([*blocks, *blocks[: len(alphas)]], info.columns[1:], parts, strict=True):
-        values = _decompressed(part, each.texels.numel(), column, len(each.texels))
+        values = _decompressed(part, each.texels.numel(), column, digest, len(each.texels))
         if np.abs(values).max(initial=0) > _MOST_COEFFICIENT:
             raise StreamError(f"a coefficient of {column.name} is beyond {_MOST_COEFFICIENT}")
         narrow = torch.from_numpy(values.astype(np.int32, order="C"))
@@ -193,8 +220,9 @@ def _check_columns(
         raise StreamError(f"the columns are {found}, not {list(names)}")
     steps = {}
     for column in columns:
-        if column.numbers != numbers[column.name]:
-            raise StreamError(f"the column {column.name} needs {numbers[column.name]} numbers, not {column.numbers}")
+        if len(column.bytes) != numbers[column.name]:
+            wanted = f"{numbers[column.name]} numbers, not {len(column.bytes)}"
+            raise StreamError(f"the column {column.name} needs {wanted}")
         if column.name in stepped:
             if column.step is None:
                 raise StreamError(f"the column {column.name} has no step")
@@ -226,11 +254,12 @@ def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
 def _parts(data: memoryview, columns: Sequence[ColumnEntry]) -> Iterator[memoryview]:
     at = 0
     for column in columns:
-        yield data[at : at + column.size]
-        at += column.size
+        size = sum(column.bytes)
+        yield data[at : at + size]
+        at += size
 
 
 def _check_size(columns: Sequence[ColumnEntry], size: int) -> None:
-    stated = sum(column.size for column in columns)
+    stated = sum(sum(column.bytes) for column in columns)
     if stated != size:
         raise StreamError(f"truncated or too long: the columns need {stated} bytes, the file has {size}")

@@ -18,19 +18,17 @@ from bitymi_ns.bundle import strict_json
 from bitymi_ns.bundle.statistics import Decibels, Part, Share, Statistics, Whole
 from bitymi_ns.bundle.world import Coordinate, WorldEntry
 from bitymi_ns.codec.limits import ALPHA_SCALE, EXTENTS, LIMITS, RESIDUAL_LIMIT
-from bitymi_ns.codec.streams import MOST_PLANES
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_kinds import Kind
 from bitymi_ns.ranges import describe_problems, short
 
 FORMAT = "bitymi-bundle"
-COMPACT_VERSION = (5, 0)  # entropy-coded columns; the newest version that is read
-ALPHA_VERSION = (4, 0)  # alphas of texels, which readers of version 3 would draw opaque
-LEAN_VERSION = (2, 3)  # lean view colours in a PLY file, refused by readers of version 1
-FULL_VERSION = (1, 4)  # surfels with all parameters
-_DIGEST_SINCE = {1: 2, 2: 1, 3: 0}  # major version: first minor version with a digest
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
+VERSION = "6.0"
+EARLIER = {"1.4": SURFELS, "2.3": SURFELS, "4.0": SURFELS, "5.0": COMPACT_SURFELS}
+"""Versions that are read as `VERSION`, and the file of surfels that each had: whole view colours, lean ones, alphas of
+texels, entropy-coded columns."""
 POSTER = "poster.webp"  # optional picture of a viewer's first view: `bundle.poster`
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -110,37 +108,11 @@ Point = tuple[Coordinate, Coordinate, Coordinate]
 
 
 class ColumnEntry(Part):
-    """Integer column: `bytes` are the `sizes` of `streams.Compressed`; before version 5, `low` and `planes` are the
-    arguments of `streams.decompress_planes`."""
+    """Integer column: `bytes` are the `sizes` of `streams.Compressed`."""
 
     name: Annotated[str, Field(pattern=r"^[a-z0-9_]{1,20}$")]
     step: Annotated[float, Field(ge=1e-12, le=1e6)] | None = None
-    bytes: Annotated[list[Annotated[int, Field(ge=0, le=1 << 40)]], Field(max_length=16)] | None = None
-    low: Annotated[list[Annotated[int, Field(ge=-(1 << 53), le=1 << 53)]], Field(max_length=16)] | None = None
-    planes: (
-        Annotated[
-            list[Annotated[list[Annotated[int, Field(ge=1, le=1 << 40)]], Field(max_length=MOST_PLANES)]],
-            Field(max_length=16),
-        ]
-        | None
-    ) = None
-
-    @model_validator(mode="after")
-    def _is_of_one_kind(self) -> ColumnEntry:
-        of_planes = self.low is not None and self.planes is not None and len(self.low) == len(self.planes)
-        if of_planes == (self.bytes is not None):
-            raise PydanticCustomError("column", "a column needs bytes, or as many numbers in low as in planes")
-        return self
-
-    @property
-    def numbers(self) -> int:
-        """Numbers per row."""
-        return len(self.bytes if self.bytes is not None else self.low or ())
-
-    @property
-    def size(self) -> int:
-        """Bytes of all numbers."""
-        return sum(self.bytes if self.bytes is not None else map(sum, self.planes or ()))
+    bytes: Annotated[list[Annotated[int, Field(ge=0, le=1 << 40)]], Field(max_length=16)]
 
 
 class PositionFrame(Part):
@@ -191,7 +163,7 @@ class AtlasEntry(Part):
     range: str | None = None
     alpha_scale: Annotated[float, Field(gt=0, le=2)] | None = None
     """Scale of the fourth channel: alpha = alpha_scale * value multiplies the surfel's opacity; a surfel without a tile
-    has the alpha of its column. None: opaque texels. Since version 4."""
+    has the alpha of its column. None: opaque texels."""
     clipped_fraction: Share | None = None
     encoder: str | None = None
     psnr: Decibels = None
@@ -233,8 +205,7 @@ class RenderEntry(Part):
     low_pass: _only(1.0) = 1.0  # type: ignore[valid-type]
     prefilter: Literal["low_pass"] | None = None  # which earlier versions state
     photographed: Annotated[str, AfterValidator(_points)] | None = None
-    """Points of the scene with the pixels per unit of length of their photographs (`points_text`): since versions 1.4
-    and 2.3."""
+    """Points of the scene with the pixels per unit of length of their photographs (`points_text`)."""
     background: tuple[Share, Share, Share]
 
 
@@ -266,6 +237,8 @@ class Manifest(Part):
     bounds: Bounds
     statistics: Statistics
     files: Annotated[dict[str, FileEntry], Field(max_length=1 << 14)]
+    decoded: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
+    """SHA-256 of the integers of surfels.bin and texels.bin (`compact.decoded_hash`): 5.0 has none."""
     digest: str | None = None  # SHA-256 of the canonical JSON of everything else
 
     @model_validator(mode="after")
@@ -284,20 +257,10 @@ class Manifest(Part):
     @model_validator(mode="after")
     def _surfels_fit(self) -> Manifest:
         surfels, compact = self.surfels, self.surfels.file == COMPACT_SURFELS
-        major = int(self.version.split(".")[0])
-        if major != 4 and compact != (major in (3, 5)):
-            raise PydanticCustomError(
-                "file", "surfels.file must be surfels.bin in versions 3 and 5, and in no earlier one"
-            )
-        columns = [*(surfels.columns or ()), *(self.atlas and self.atlas.columns or ())]
-        if any((column.bytes is not None) != (major == 5) for column in columns):
-            raise PydanticCustomError("column", "columns must have bytes in version 5, low and planes in earlier ones")
         if compact and None in (surfels.frame, surfels.columns, surfels.terms):
             raise PydanticCustomError("file", "surfels.bin needs surfels.frame, columns and terms")
         if self.atlas is not None and compact != (self.atlas.file == TEXELS):
             raise PydanticCustomError("file", "atlas.file must be texels.bin beside surfels.bin, and atlas.ktx2 else")
-        if major != 5 and self.has_alpha != (major == 4):
-            raise PydanticCustomError("alpha", "atlas.alpha_scale must be stated in version 4, and in no earlier one")
         return self
 
     @property
@@ -341,7 +304,7 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
         if not isinstance(info, dict) or info.get("format") != FORMAT:
             raise BundleError(f"{source} is not a bundle: its format is not {FORMAT!r}")
         stated = info.pop("digest", None)
-        version = _version(info.get("version"), source)
+        _check_version(info, source)
         text = strict_json.canonical(info)
         found = strict_json.digest_of(text)
     except BundleError:
@@ -352,9 +315,9 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
         manifest = Manifest.model_validate_json(text)
     except ValidationError as error:
         raise BundleError(f"{source}: {describe_problems(error)}") from error
-    if stated is None and version[1] >= _DIGEST_SINCE.get(version[0], 0):
+    if stated is None:
         raise BundleError(f"{source}: digest is missing{_ON_PURPOSE.format(found)}")
-    if stated is not None and stated != found:
+    if stated != found:
         raise BundleError(f"{source} is altered: its digest is not that of its contents{_ON_PURPOSE.format(found)}")
     manifest.digest = stated
     return manifest
@@ -363,13 +326,17 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
 _ON_PURPOSE = '; if you have edited it on purpose, set "digest" to "{}"'
 
 
-def _version(version: Any, source: str) -> tuple[int, int]:
-    found = re.fullmatch(r"([0-9]{1,6})\.([0-9]{1,6})", version) if isinstance(version, str) else None
+def _check_version(info: Mapping[str, Any], source: str) -> None:
+    version, surfels = info.get("version"), info.get("surfels")
+    found = re.fullmatch(r"([0-9]{1,6})\.[0-9]{1,6}", version) if isinstance(version, str) else None
     if found is None:
-        raise BundleError(f"{source}: version must look like 1.0, not {short(version)}")
-    if int(found[1]) > COMPACT_VERSION[0]:
+        raise BundleError(f"{source}: version must look like {VERSION}, not {short(version)}")
+    newest = VERSION.split(".")[0]
+    if int(found[1]) > int(newest):
+        limit = f"this program reads up to {newest}.x: update bitymi-ns to open it"
+        raise BundleError(f"{source} has version {version}, {limit}")
+    file = surfels.get("file", SURFELS) if isinstance(surfels, dict) else None
+    if found[1] != newest and EARLIER.get(version) != file:
         raise BundleError(
-            f"{source} has version {found[0]}, this program reads up to {COMPACT_VERSION[0]}.x: update bitymi-ns to "
-            "open it"
+            f"{source} has version {version} with {short(file)}, which is read no longer: export it again"
         )
-    return int(found[1]), int(found[2])

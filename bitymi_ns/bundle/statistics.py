@@ -73,8 +73,6 @@ class Certificate(Part):
     worst: Measured = None  # 8-bit steps
     texel_rms: Measured = None
     """Root mean square over all texels without weights, 8-bit steps."""
-    marks: Annotated[str, Field(min_length=1368, max_length=1368, pattern=r"^[A-Za-z0-9+/]{1366}==$")] | None = None
-    """Count sketches of 2 x 128 sums, before quantisation and as stored (`sketch.sketches_text`)."""
 
     @classmethod
     def of(cls, errors: Tensor, tolerance: float) -> Certificate:

@@ -24,7 +24,7 @@ Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 class WorldEntry(Part):
     """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), and the scene's up vector and
-    metric scale if known: since versions 1.3 and 2.2."""
+    metric scale if known."""
 
     transform: tuple[Row, Row, Row]
     scale: Positive

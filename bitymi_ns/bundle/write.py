@@ -14,16 +14,13 @@ from bitymi_ns import __version__
 from bitymi_ns.bundle import compact, ktx2, ply
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
-    ALPHA_VERSION,
     ATLAS,
     COMPACT_SURFELS,
-    COMPACT_VERSION,
-    FULL_VERSION,
-    LEAN_VERSION,
     MANIFEST,
     POSTER,
     SURFELS,
     TEXELS,
+    VERSION,
     BundleError,
     check_file_name,
     describe,
@@ -131,18 +128,21 @@ def write_bundle(
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
     """Encode surfels.bin and, if there are texels, texels.bin, adding their description to `info`."""
-    of_surfels, surfels = compact.encode_surfels(codes.surfels, codes.residual, codes.residual_step, codes.alpha)
+    digest = hashlib.sha256()
+    of_surfels, surfels = compact.encode_surfels(
+        codes.surfels, codes.residual, codes.residual_step, codes.alpha, digest
+    )
     info["surfels"] |= {"file": COMPACT_SURFELS, **of_surfels}
-    info["version"] = "{}.{}".format(*COMPACT_VERSION)
     parts = {COMPACT_SURFELS: surfels}
     if codes.texels is not None:
-        of_texels, parts[TEXELS] = compact.encode_texels(codes.texels)
+        of_texels, parts[TEXELS] = compact.encode_texels(codes.texels, digest)
         pages = {"page_width": codes.page_width, "page_rows": codes.page_rows}
         info["atlas"] |= {"file": TEXELS, "format": "dct", **pages, **of_texels}
         info["atlas"].pop("extent_column")
         if "atlas" in info["statistics"]:
             cost = dict(info["statistics"]["atlas"])
             info["statistics"]["atlas"] = {**cost, "bytes": len(parts[TEXELS])}
+    info["decoded"] = digest.hexdigest()
     return parts
 
 
@@ -157,10 +157,9 @@ def _describe(
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
     means, lean = surfels["means"].detach(), "view_terms" in surfels
-    version = ALPHA_VERSION if _has_alpha(atlas) else LEAN_VERSION if lean else FULL_VERSION
     empty = len(means) == 0
     described: dict[str, Any] = {
-        "version": f"{version[0]}.{version[1]}",
+        "version": VERSION,
         "generator": GENERATOR,
         "surfels": {"count": len(means), "view_color": kind},
         "atlas": None,

@@ -109,14 +109,6 @@ def paged_texels(texels: Tensor, packing: Packing, elsewhere: float = 0.0) -> Te
     return pages
 
 
-def scene_texels(scene: BakedScene) -> Tensor:
-    """Return the residual colours [T, 3] of a scene on the CPU, the mean residual for a surfel without a tile."""
-    assert scene.mean_residual is not None
-    if scene.atlas is None and scene.blocks is None:
-        return scene.mean_residual
-    return _listed(scene, scene.residuals(), scene.mean_residual)
-
-
 def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
     """Return the alpha texels of a scene on its device, the mean alpha for a surfel without a tile; None if the scene
     has no alpha.

@@ -1,4 +1,4 @@
-"""Integer columns as bytes: entropy-coded since version 5, a Zstandard frame per byte plane before."""
+"""Integer columns as bytes, entropy-coded."""
 
 import math
 from collections.abc import Sequence
@@ -7,12 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import zstandard
 
 from bitymi_ns.ops.backend import load
 
-MOST_PLANES = 7  # bytes of an integer that a float64 holds exactly
-_WINDOW = 1 << 23
 Others = npt.NDArray[np.uint8] | None  # [rows] sums of the magnitudes of a row's earlier numbers
 _OTHERS = 2  # largest context from a row's earlier numbers
 
@@ -69,48 +66,3 @@ def _others(before: Others, number: npt.NDArray[np.int64], blocks: int) -> Other
         return None
     least = np.clip(np.abs(number), 0, _OTHERS).astype(np.uint8)
     return least if before is None else np.minimum(before + least, _OTHERS).astype(np.uint8)
-
-
-def decompress_planes(
-    view: memoryview, rows: int, low: Sequence[int], planes: Sequence[Sequence[int]]
-) -> npt.NDArray[np.int64]:
-    """Decompress a column [rows, n] of versions 3 and 4, byte plane by byte plane.
-
-    Args:
-        view: a Zstandard frame per byte plane, number after number.
-        low: smallest value of each number.
-        planes: bytes of each number's frames, least significant plane first.
-
-    Raises:
-        StreamError: a frame is damaged or its size does not match `rows`.
-    """
-    codes = np.empty((rows, len(low)), dtype=np.int64)
-    at = 0
-    for number, sizes in enumerate(planes):
-        column = np.zeros(rows, dtype=np.int64)
-        for plane, size in enumerate(sizes):
-            column += plane_bytes(view[at : at + size], rows).astype(np.int64) << (8 * plane)
-            at += size
-        codes[:, number] = column + low[number]
-    if at != len(view):
-        raise StreamError(f"the frames have {at} bytes, not {len(view)}")
-    return codes
-
-
-def plane_bytes(frame: memoryview, size: int) -> npt.NDArray[np.uint8]:
-    """Decompress a frame of exactly `size` bytes; its header is checked before allocating.
-
-    Raises:
-        StreamError: the frame is damaged or has another size.
-    """
-    try:
-        header = zstandard.get_frame_parameters(bytes(frame[:32]))
-        if header.content_size != size or header.dict_id or header.window_size > max(_WINDOW, size):
-            raise StreamError(f"a frame declares {header.content_size} bytes, {size} are wanted")
-        decompressor = zstandard.ZstdDecompressor(max_window_size=max(_WINDOW, 1 << max(10, size.bit_length())))
-        data = decompressor.decompress(bytes(frame), max_output_size=size, allow_extra_data=False)
-    except zstandard.ZstdError as error:
-        raise StreamError(f"a frame is damaged ({error})") from error
-    if len(data) != size:
-        raise StreamError(f"a frame holds {len(data)} bytes, {size} are wanted")
-    return np.frombuffer(data, np.uint8)

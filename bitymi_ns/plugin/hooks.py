@@ -27,7 +27,7 @@ from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataparser import BundleCamerasConfig, has_cameras
 from bitymi_ns.plugin.data.views import DATA
-from bitymi_ns.plugin.run import checkpoints, render, run_folder
+from bitymi_ns.plugin.run import checkpoints, render
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, check_same_capture
 from bitymi_ns.plugin.run.films import WholeText, open_gzip, write_image
 from bitymi_ns.plugin.run.surfel_model import SurfelModel
@@ -146,7 +146,6 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     model, evaluated, found = config.pipeline.model, _folder_being_evaluated(), _running_command()
     if evaluated is not None:
         exit_messages.install()
-        run_folder.check_options(evaluated)
         refuse_others()
         patch_viewer(config)
         patch_render()

@@ -68,7 +68,7 @@ def test_a_compact_bundle_keeps_the_alphas_that_its_colours_were_tuned_over(trai
     export(baked, folder := tmp_path / "b")
     bundle, checks = check_files(folder)
     assert all(check.ok for check in checks), checks
-    assert bundle.info.version == "5.0"
+    assert bundle.info.version == "6.0"
     shown = read_bundle(folder).scene
     torch.testing.assert_close(rgb(shown, camera), rgb(baked.stored(), camera), rtol=0, atol=1e-6)
     assert psnr(rgb(shown, camera), want) > 38

@@ -72,20 +72,20 @@ def pages_of(codes: SceneCodes) -> tuple[np.ndarray, Packing]:
     return paged_texels(texels if alphas is None else torch.cat([texels, alphas[:, None]], 1), packing).numpy(), packing
 
 
-STORED = 12  # surfels of the stored bundles
+EARLIER = Path(__file__).parents[2] / "web" / "test" / "earlier_bundles.json"
+"""By version, the files of a bundle as it wrote them, and the numbers that it read."""
 
 
-def stored(name: str) -> dict[str, dict[str, bytes]]:
-    """Read a bundle of version 3 or 4 that the web tests have, and the numbers that the package read from it then."""
-    path = Path(__file__).parents[2] / "web" / "test" / "compact_planes.json"
-    parts = json.loads(path.read_text("utf8"))[name]
+def earlier(version: str) -> dict[str, dict[str, bytes]]:
+    """Read a stored bundle of an earlier version."""
+    parts = json.loads(EARLIER.read_text("utf8"))[version]
     return {part: {key: base64.b64decode(text) for key, text in values.items()} for part, values in parts.items()}
 
 
-def write_stored(name: str, folder: Path) -> Path:
+def write_earlier(version: str, folder: Path) -> Path:
     """Write the files of such a bundle."""
     folder.mkdir()
-    for file, data in stored(name)["files"].items():
+    for file, data in earlier(version)["files"].items():
         (folder / file).write_bytes(data)
     return folder
 

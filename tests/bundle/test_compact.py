@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from bitymi_ns.bundle import BundleError, check_files, ply, read, read_bundle, sizes
+from bitymi_ns.bundle.manifest import EARLIER
 from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.bundle.sizes import least_memory
 from bitymi_ns.cli import main
@@ -21,12 +22,12 @@ from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bundle.compact_scene import (
     FINEST,
     RANGE,
+    earlier,
     make_codes,
     pages_of,
     scene_of,
-    stored,
     write_compact,
-    write_stored,
+    write_earlier,
 )
 from tests.bundle.damage import amend, recode, signed
 from tests.bundle.test_read import peak
@@ -43,7 +44,7 @@ def test_a_compact_bundle_holds_what_its_codes_stand_for(
     assert {path.name for path in folder.iterdir()} == names
     bundle, checks = check_files(folder)
     assert bundle is not None and all(check.ok for check in checks), checks
-    assert bundle.info.version == "5.0"
+    assert bundle.info.version == "6.0"
     want, got = scene_of(codes), bundle.scene
     for name, value in want.surfels.items():
         torch.testing.assert_close(got.surfels[name], value, rtol=0, atol=0)
@@ -123,13 +124,11 @@ def _column(info: dict, name: str) -> dict:
         (lambda i: i["surfels"]["columns"].reverse(), "the columns are"),
         (lambda i: i["surfels"].pop("frame"), "surfels.bin needs surfels.frame, columns and terms"),
         (lambda i: i["surfels"].update(file="surfels.ply"), "files must list surfels.ply"),
-        (lambda i: i.update(version="2.2"), "surfels.file must be surfels.bin in versions 3 and 5"),
+        (lambda i: i.update(version="4.0"), "version 4.0 with 'surfels.bin', which is read no longer: export it again"),
         (lambda i: _column(i, "rotation").update(step=None), "rotation has no step"),
         (lambda i: _column(i, "rotation").update(step=-1.0), "must be greater than or equal to"),
-        (lambda i: i.update(version="3.0"), "columns must have bytes in version 5"),
         (lambda i: _column(i, "rotation")["bytes"].append(0), "rotation needs 3 numbers, not 4"),
-        (lambda i: _column(i, "rotation").update(low=[0], planes=[[]]), "a column needs bytes, or as many numbers"),
-        (lambda i: _column(i, "rotation").pop("bytes"), "a column needs bytes, or as many numbers"),
+        (lambda i: _column(i, "rotation").pop("bytes"), "columns.2.bytes is missing"),
         (lambda i: i["atlas"].update(texels=5), "atlas.texels says 5"),
         (lambda i: i["atlas"].update(width=1 << 20, height=1 << 20), "texels cannot be in"),
         (lambda i: i["atlas"].update(height=i["atlas"]["height"] + 4), "width, height and layers of the atlas are oth"),
@@ -176,17 +175,14 @@ def test_numbers_that_no_column_has_are_refused(tmp_path: Path, name: str, chang
         read_bundle(folder)
 
 
-@pytest.mark.parametrize("name", ["alpha", "sg"])
-def test_bundles_of_versions_3_and_4_are_read_as_they_were(tmp_path: Path, name: str) -> None:
-    """The web tests' bundles with Zstandard frames, and the numbers that the package read from them then."""
-    folder = write_stored(name, tmp_path / "b")
+@pytest.mark.parametrize("version", EARLIER)
+def test_bundles_of_earlier_versions_are_read_as_they_were(tmp_path: Path, version: str) -> None:
+    folder = write_earlier(version, tmp_path / "b")
     bundle, checks = check_files(folder)
     assert bundle is not None and all(check.ok for check in checks), checks
-    assert bundle.info.version == ("4.0" if name == "alpha" else "3.0")
-    scene = bundle.scene
-    found = {**scene.surfels, "tiles": scene.tiles, "extent": scene.extent, "mean_residual": scene.mean_residual}
-    found |= {"atlas": scene.atlas} | ({} if scene.mean_alpha is None else {"mean_alpha": scene.mean_alpha})
-    want = stored(name)["scene"]
+    assert bundle.info.version == version
+    scene, want = bundle.scene, earlier(version)["scene"]
+    found = {**scene.surfels, **{name: getattr(scene, name) for name in want if name not in scene.surfels}}
     assert set(found) == set(want)
     for key, data in want.items():
         assert np.ascontiguousarray(found[key].numpy()).tobytes() == data, key

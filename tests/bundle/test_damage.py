@@ -52,9 +52,9 @@ def test_damage_is_named(surfels, tmp_path):
 def test_versions(surfels, tmp_path):
     target = tmp_path / "b"
     make(surfels, target)
-    amend(target, lambda info: info.update(version="1.7", holograms={"yes": True}))
+    amend(target, lambda info: info.update(version="6.7", holograms={"yes": True}))
     assert read_bundle(target).info.holograms == {"yes": True}
-    amend(target, lambda info: info.update(version="6.0"))
+    amend(target, lambda info: info.update(version="7.0"))
     with pytest.raises(BundleError, match="update bitymi-ns"):
         read_bundle(target)
     amend(target, lambda info: info.update(version="one"))

@@ -53,7 +53,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
 def test_alphas_are_read_as_they_were_written(surfels, tmp_path, format, lean):
     _, _, texels, atlas = make(surfels, tmp_path / "b", "sh", format, lean=lean, alpha=True)
     loaded = read_bundle(tmp_path / "b")
-    assert loaded.info.version == "4.0" and loaded.scene.alpha_scale == loaded.info.atlas.alpha_scale
+    assert loaded.info.version == "6.0" and loaded.scene.alpha_scale == loaded.info.atlas.alpha_scale
     torch.testing.assert_close(loaded.scene.mean_alpha, torch.linspace(0, 2, 6), rtol=0, atol=0)
     alphas = loaded.scene.alphas()
     torch.testing.assert_close(alphas, torch.from_numpy(atlas.decoded()[..., 3]))
@@ -68,7 +68,7 @@ def test_alphas_are_read_as_they_were_written(surfels, tmp_path, format, lean):
 def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
     params, *_ = make(surfels, tmp_path / "b", kind, None, lean=True)
     loaded = read_bundle(tmp_path / "b")
-    assert loaded.scene.view_color == kind and loaded.info.version == "2.3"
+    assert loaded.scene.view_color == kind and loaded.info.version == "6.0"
     assert set(loaded.scene.surfels) == set(params)
     d = torch.nn.functional.normalize(params["means"], dim=1)
     want = reference.lean(kind, params["view_base"], params["view_span"], params["view_terms"], d)
@@ -118,7 +118,7 @@ def test_the_manifest_states_files_world_and_statistics(surfels, tmp_path):
     extra = {"preview.png": b"\x89PNG...", "config.yml": b"method: bitymi\n"}
     params, *_ = make(surfels, tmp_path / "b", world=world, statistics=statistics, extra_files=extra)
     info = read_bundle(tmp_path / "b").info.model_dump(mode="json")
-    assert (info["format"], info["version"]) == ("bitymi-bundle", "1.4")
+    assert (info["format"], info["version"]) == ("bitymi-bundle", "6.0")
     assert info["generator"].startswith("bitymi-ns ")
     assert info["world"] == {"transform": [[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]], "scale": 0.25}
     assert info["statistics"] == {"psnr": 27.5, "never": None, "views": [1, 2], "path": str(tmp_path)}

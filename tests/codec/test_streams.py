@@ -4,11 +4,10 @@ import tracemalloc
 
 import numpy as np
 import pytest
-import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.codec.streams import StreamError, compress, decompress, decompress_planes, plane_bytes
+from bitymi_ns.codec.streams import StreamError, compress, decompress
 from tests.codec.reference import decode_integers
 
 
@@ -94,20 +93,3 @@ def test_tables_take_bounded_memory() -> None:
         decompress(memoryview(b"\0\2\0" + b"\xff" * 1000), 10, [1003])
     assert tracemalloc.get_traced_memory()[1] < 1 << 20
     tracemalloc.stop()
-
-
-def test_frames_of_another_size_or_form_are_refused() -> None:
-    frame = zstandard.compress(bytes(1000))
-    for size in (999, 1001, 0):
-        with pytest.raises(StreamError, match=f"declares 1000 bytes, {size} are wanted"):
-            plane_bytes(memoryview(frame), size)
-    hidden = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1000))
-    for data in (hidden, frame + b"\0", b"no frame"):
-        with pytest.raises(StreamError):
-            plane_bytes(memoryview(data), 1000)
-
-
-def test_planes_of_earlier_versions_are_read() -> None:
-    low, high = zstandard.compress(bytes([1, 2, 3])), zstandard.compress(bytes([0, 1, 0]))
-    codes = decompress_planes(memoryview(low + high), 3, [-5, 7], [[len(low), len(high)], []])
-    np.testing.assert_array_equal(codes, [[-4, 7], [253, 7], [-2, 7]])

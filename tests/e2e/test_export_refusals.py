@@ -125,6 +125,6 @@ def test_bundles_that_are_damaged_newer_or_gone(copied: Path, tmp_path: Path) ->
     with pytest.raises(InputError, match="atlas.ktx2 is truncated.*or export the scene again"):
         eval_setup(copied / "config.yml")
     info = json.loads((copied / "bundle.json").read_text())
-    (copied / "bundle.json").write_text(json.dumps({**info, "version": "6.0"}))
+    (copied / "bundle.json").write_text(json.dumps({**info, "version": "7.0"}))
     with pytest.raises(InputError, match="version 6.0.*update bitymi-ns"):
         eval_setup(copied / "config.yml")

@@ -1,15 +1,17 @@
 import { describe, expect, it } from 'vitest';
 import { parseKtx2 } from '../src/bundle/ktx2';
 import { parseManifest } from '../src/bundle/manifest';
+import { readCompactSurfels } from '../src/bundle/compact/surfels';
 import { SURFEL_WORDS, WORD, alphaIn, layerIn, readSurfels } from '../src/bundle/surfels';
 import { DamagedBundle, ViewerError } from '../src/errors';
+import { EARLIER, bytes, floats } from './compact_bundles';
 
 const HASH = 'a'.repeat(64);
 const RENDER = { near: 0.1, weight_bound: 0.02, background: [0, 0, 0] };
 const manifest = (changes: object = {}): string =>
   JSON.stringify({
     format: 'bitymi-bundle',
-    version: '2.2',
+    version: '6.0',
     surfels: { count: 2, view_color: 'sv', terms: 1 },
     atlas: null,
     render: RENDER,
@@ -82,7 +84,7 @@ describe('bundle.json', () => {
     expect(info.files.get('surfels.ply')?.bytes).toBe(1);
   });
   it('of a newer major version is refused, with what to do', () => {
-    expect(() => parseManifest(manifest({ version: '6.0' }))).toThrowError(/version 6.0/);
+    expect(() => parseManifest(manifest({ version: '7.0' }))).toThrowError(/version 7.0/);
     try {
       parseManifest(manifest({ version: '7.1' }));
     } catch (error) {
@@ -96,10 +98,11 @@ describe('bundle.json', () => {
     ['a kind that is none', manifest({ surfels: { count: 1, view_color: 'xx' } })],
     ['a count that is no whole number', manifest({ surfels: { count: 1.5, view_color: 'sv' } })],
     ['files that are no objects', manifest({ files: { 'surfels.ply': 3 } })],
-    ['alphas below version 4', manifest({ version: '2.2', atlas: { ...ATLAS, alpha_scale: 1 } })],
-    ['no alphas in version 4', manifest({ version: '4.0', atlas: ATLAS })],
   ])('with %s is refused', (_, text) => {
     expect(() => parseManifest(text)).toThrowError(DamagedBundle);
+  });
+  it.each(['1.3', '2.2', '3.0', '5.0'])('of version %s with surfels.ply is refused: export it again', (version) => {
+    expect(() => parseManifest(manifest({ version }))).toThrowError(/read no longer|has version/);
   });
   it('of something else is refused', () => {
     expect(() => parseManifest('{"format":"x"}')).toThrowError(ViewerError);
@@ -139,7 +142,7 @@ describe('surfels.ply', () => {
   });
   it('with alphas has them beside the layers of the tiles', () => {
     const atlas = { ...ATLAS, alpha_scale: 255 / 128 };
-    const about = parseManifest(manifest({ version: '4.0', atlas }));
+    const about = parseManifest(manifest({ atlas }));
     const rows = (second: number): ArrayBuffer => {
       const each = [0.5, second].map((alpha, i) => [...row(i, 0).slice(0, FLOATS.length), alpha, 0, 0, 0, i, 4, 4]);
       return ply(each, [], [...FLOATS, 'alpha']);
@@ -162,7 +165,7 @@ describe('surfels.ply', () => {
 });
 
 describe('atlas.ktx2', () => {
-  it('that is something else is refused', async () => {
+  it('that is something else is refused', () => {
     const atlas = {
       format: 'bc7',
       width: 4,
@@ -174,6 +177,29 @@ describe('atlas.ktx2', () => {
       alphaScale: 0,
       coded: null,
     } as const;
-    await expect(parseKtx2(new ArrayBuffer(200), atlas)).rejects.toThrowError(DamagedBundle);
+    expect(() => parseKtx2(new ArrayBuffer(200), atlas)).toThrowError(DamagedBundle);
+  });
+});
+
+describe.each(Object.entries(EARLIER))('the stored bundle of version %s', (version, { files, scene }) => {
+  const info = parseManifest(new TextDecoder().decode(bytes(files['bundle.json'])));
+  const surfels = info.compact
+    ? readCompactSurfels(bytes(files['surfels.bin']), info)
+    : readSurfels(bytes(files['surfels.ply']).buffer as ArrayBuffer, info);
+  it('opens with the numbers that the package reads', () => {
+    expect(info.version).toBe(version);
+    const [means, alphas] = [floats(scene.means), 'mean_alpha' in scene ? floats(scene.mean_alpha) : null];
+    const numbers = new Uint32Array(surfels.words.buffer);
+    for (let i = 0; i < info.count; i++) {
+      const at = i * SURFEL_WORDS;
+      for (let c = 0; c < 3; c++) {
+        expect(surfels.words[at + c] + surfels.origin[c]).toBeCloseTo(means[3 * i + c], 5);
+      }
+      if (alphas) expect(alphaIn(numbers[at + WORD.layer])).toBe(alphas[i]);
+    }
+    if (files['atlas.ktx2']) {
+      const pages = parseKtx2(bytes(files['atlas.ktx2']).buffer as ArrayBuffer, info.atlas!);
+      if (info.atlas!.format === 'uint8') expect(Buffer.concat(pages.layers).equals(bytes(scene.atlas))).toBe(true);
+    }
   });
 });

@@ -6,7 +6,7 @@ import { readCompactTexels } from '../src/bundle/compact/texels';
 import { parseManifest } from '../src/bundle/manifest';
 import { SURFEL_WORDS, WORD, layerIn } from '../src/bundle/surfels';
 import { DamagedBundle } from '../src/errors';
-import { BUNDLES, PLANES, bytes, frameOf } from './compact_bundles';
+import { BUNDLES, bytes } from './compact_bundles';
 
 const EXAMPLES = 4000 * Number(process.env.VIEWER_FUZZ ?? 1);
 const MOST_TIME = 2000; // milliseconds per bundle
@@ -38,7 +38,7 @@ interface Described {
   surfels: Json & { frame: Json; columns: Row[] };
   atlas: Json & { columns: Row[] };
 }
-type Row = Json & { bytes?: number[]; low?: number[]; planes?: number[][] };
+type Row = Json & { bytes: number[] };
 type Files = Record<'surfels.bin' | 'texels.bin', Uint8Array>;
 
 class Vandal {
@@ -61,7 +61,7 @@ class Vandal {
     for (const [name, { columns }] of [['surfels.bin', info.surfels] as const, ['texels.bin', info.atlas] as const]) {
       let at = 0;
       for (const { bytes } of columns) {
-        bytes!.forEach((size, k) => numbers.push([name, bytes!, k, files[name].subarray(at, (at += size))]));
+        bytes.forEach((size, k) => numbers.push([name, bytes, k, files[name].subarray(at, (at += size))]));
       }
     }
     const [name, sizes, k, old] = this.of(numbers);
@@ -74,28 +74,6 @@ class Vandal {
       ...files[name].subarray(from + old.length),
     ]);
     sizes[k] = data.length;
-  }
-
-  // Changes the bytes of a frame, keeping it valid, or their number.
-  replace(info: Described, files: Files): void {
-    if (info.surfels.columns[0].bytes) return this.swap(info, files);
-    const name = this.of(['surfels.bin', 'texels.bin'] as const);
-    const { columns } = name === 'surfels.bin' ? info.surfels : info.atlas;
-    const places: [number[], number, number][] = [];
-    let at = 0;
-    for (const { planes } of columns.values()) {
-      for (const sizes of planes!) sizes.forEach((size, k) => (places.push([sizes, k, at]), (at += size)));
-    }
-    const [sizes, k, begin] = this.of(places);
-    const data = files[name];
-    const held = Math.min(1 << 16, data[begin + 5] + (data[begin + 4] >> 6 ? 256 * (data[begin + 6] + 1) : 0));
-    const content = new Uint8Array(this.of([held, held, held, held, 0, 1, held + 1]));
-    const same = this.below(256);
-    const constant = this.next() < 0.3;
-    for (let i = 0; i < content.length; i++) content[i] = constant ? same : this.below(256);
-    const frame = frameOf(content);
-    files[name] = Uint8Array.from([...data.subarray(0, begin), ...frame, ...data.subarray(begin + sizes[k])]);
-    sizes[k] = frame.length;
   }
 
   misstate(info: Described): void {
@@ -118,8 +96,7 @@ class Vandal {
     ];
     for (const column of [...surfels.columns, ...atlas.columns]) {
       places.push([column, 'step']);
-      const numbers = column.bytes ?? column.low!;
-      numbers.forEach((_, k) => places.push([numbers as unknown as Json, `${k}`]));
+      column.bytes.forEach((_, k) => places.push([column.bytes as unknown as Json, `${k}`]));
     }
     const [at, key] = this.of(places);
     const values = [0, 1, -1, 2, 5, 255, 2 ** 20, 2 ** 31, -(2 ** 40), 2 ** 40, 1e-9, 1e6, 1e300, -99, null];
@@ -160,32 +137,26 @@ function opens(info: Described, files: Files): boolean {
   }
 }
 
-it.each([
-  ['5.0', BUNDLES.alpha],
-  ['4.0', PLANES.alpha],
-])(
-  `${EXAMPLES} damaged bundles of version %s are refused, or have numbers within their limits`,
-  (_, { files }) => {
-    const vandal = new Vandal(draws(1));
-    const text = new TextDecoder().decode(bytes(files['bundle.json']));
-    let [found, slowest] = [0, 0];
-    for (let k = 0; k < EXAMPLES; k++) {
-      const info = JSON.parse(text) as Described;
-      const data = { 'surfels.bin': bytes(files['surfels.bin']), 'texels.bin': bytes(files['texels.bin']) };
-      for (let times = vandal.of([1, 1, 1, 2, 5]); times; times--) {
-        const how = vandal.below(4);
-        if (how === 0) vandal.flip(info, data);
-        else if (how === 3) vandal.misstate(info);
-        else vandal.replace(info, data);
-      }
-      const begin = performance.now();
-      if (opens(info, data)) found++;
-      slowest = Math.max(slowest, performance.now() - begin);
+it(`${EXAMPLES} damaged bundles are refused, or have numbers within their limits`, () => {
+  const { files } = BUNDLES.alpha;
+  const vandal = new Vandal(draws(1));
+  const text = new TextDecoder().decode(bytes(files['bundle.json']));
+  let [found, slowest] = [0, 0];
+  for (let k = 0; k < EXAMPLES; k++) {
+    const info = JSON.parse(text) as Described;
+    const data = { 'surfels.bin': bytes(files['surfels.bin']), 'texels.bin': bytes(files['texels.bin']) };
+    for (let times = vandal.of([1, 1, 1, 2, 5]); times; times--) {
+      const how = vandal.below(4);
+      if (how === 0) vandal.flip(info, data);
+      else if (how === 3) vandal.misstate(info);
+      else vandal.swap(info, data);
     }
-    console.log(`${found} of ${EXAMPLES} damaged bundles open; the slowest took ${slowest.toFixed(0)} ms`);
-    expect(slowest).toBeLessThan(MOST_TIME);
-    expect(found).toBeGreaterThan(0.05 * EXAMPLES);
-    expect(found).toBeLessThan(0.95 * EXAMPLES);
-  },
-  120_000,
-);
+    const begin = performance.now();
+    if (opens(info, data)) found++;
+    slowest = Math.max(slowest, performance.now() - begin);
+  }
+  console.log(`${found} of ${EXAMPLES} damaged bundles open; the slowest took ${slowest.toFixed(0)} ms`);
+  expect(slowest).toBeLessThan(MOST_TIME);
+  expect(found).toBeGreaterThan(0.05 * EXAMPLES);
+  expect(found).toBeLessThan(0.95 * EXAMPLES);
+}, 120_000);

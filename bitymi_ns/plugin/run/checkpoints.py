@@ -1,6 +1,7 @@
 """Checkpoint files: write them whole or not at all, and read them with errors that say what to do."""
 
 import dataclasses
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,12 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     return state
 
 
+def check_removed(options: Mapping[str, Any], source: Path | str) -> None:
+    """Fail on recorded scene options that only earlier versions can draw."""
+    if options.get("prefilter", "low_pass") != "low_pass":
+        fail(f"{source} asks for scene.prefilter {options['prefilter']}, which is gone: train the scene again")
+
+
 def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
     """Fail on parameters of another method, a newer version, or scene options that differ beyond `MAY_DIFFER`."""
     extra = parameters.get("_model." + EXTRA_STATE) if isinstance(parameters, dict) else None
@@ -109,6 +116,8 @@ def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
         there, here = dict(json_of(extra["scene"])), dataclasses.asdict(scene)
     except (ValueError, TypeError, KeyError) as error:
         fail(f"the checkpoint {path} was altered: it does not say what its scene is made of. Train again.", error)
+    check_removed(there, path)
+    check_removed(vars(scene), path.parent.parent / "config.yml")
     different = [k for k in there if k in here and k not in MAY_DIFFER and there[k] != here[k]]
     if different:
         lines = "\n".join(

@@ -116,6 +116,7 @@ class BitymiTrainerConfig(TrainerConfig):
                 check_ranges(options)
             except ValueError as error:
                 fail(f"an option is out of range (--pipeline.model.*): {error}", error)
+        checkpoints.check_removed(vars(self.pipeline.model.scene), "the configuration")
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
                 option = f"--{name.replace('_', '-')} True"
@@ -204,7 +205,6 @@ class BitymiTrainerConfig(TrainerConfig):
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
             run = Path(os.path.expanduser(checkpoints_of)).absolute().parent
-            run_folder.check_options(run)
             self.take_poses_of(run)
             dataparser = self.pipeline.datamanager.dataparser
             poses = getattr(dataparser, "poses", None)

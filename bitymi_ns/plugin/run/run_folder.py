@@ -1,7 +1,6 @@
 """Folder of a training run: one process at a time trains into it, and it keeps how poses were found."""
 
 import atexit
-import re
 import shutil
 from pathlib import Path
 
@@ -14,17 +13,6 @@ from bitymi_ns.trust import check_no_links
 
 LOCK = ".lock"  # file of a training process
 POSES = "poses"  # subfolder of poses that this package found, and their report
-_REMOVED = {r"^ *prefilter: pixel$": "scene.prefilter pixel, and surfels are drawn with low_pass alone"}
-"""Lines of config.yml that only earlier versions can follow: what they ask for, and what became of it."""
-
-
-def check_options(run: Path) -> None:
-    """Stop if the config.yml of a folder, if any, asks for what this version no longer has."""
-    config = run / "config.yml"
-    text = config.read_text("utf8", "replace") if config.is_file() else ""
-    for line, what in _REMOVED.items():
-        if re.search(line, text, re.M):
-            fail(f"{config} asks for {what}: train the scene again, or use it with the version that made it.")
 
 
 def take(folder: Path) -> None:

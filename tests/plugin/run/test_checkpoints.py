@@ -107,6 +107,18 @@ def test_a_whole_checkpoint_loads(saved: Path) -> None:
     refused(saved, "another preset:\n  --pipeline.model.scene.view-color: sv there, sh here", SceneConfig("sh"))
 
 
+@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
+def test_surfels_are_drawn_as_they_were_trained(saved: Path, prefilter: str) -> None:
+    whole = state(SceneConfig())
+    extra = whole["pipeline"]["_model._extra_state"]
+    extra["scene"] = json.dumps({**json.loads(extra["scene"]), "prefilter": prefilter})
+    torch.save(whole, saved)
+    if prefilter == "low_pass":
+        checkpoints.load(saved, SceneConfig())
+    else:
+        refused(saved, "asks for scene.prefilter pixel, which is gone: train the scene again")
+
+
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_truncated(saved: Path, share: float) -> None:
     whole = saved.read_bytes()

@@ -1,4 +1,4 @@
-// KTX2: 2D array textures with one level, uncompressed or Zstandard.
+// KTX2: 2D array textures with one level, uncompressed.
 import { DamagedBundle } from '../errors';
 import type { Atlas, AtlasFormat } from './manifest';
 
@@ -32,7 +32,7 @@ function firstBeyond(texels: Uint8Array, alpha: boolean): number {
 
 export const blockOf = (format: AtlasFormat): { side: number; bytes: number } => BLOCK[format];
 
-export async function parseKtx2(data: ArrayBuffer, stated: Atlas): Promise<Pages> {
+export function parseKtx2(data: ArrayBuffer, stated: Atlas): Pages {
   const view = new DataView(data);
   if (data.byteLength < 104 || IDENTIFIER.some((byte, i) => view.getUint8(i) !== byte)) {
     throw new DamagedBundle('atlas.ktx2 is not a KTX2 file.');
@@ -48,13 +48,8 @@ export async function parseKtx2(data: ArrayBuffer, stated: Atlas): Promise<Pages
   const at = Number(view.getBigUint64(80, true));
   const length = Number(view.getBigUint64(88, true));
   if (levels !== 1 || at + length > data.byteLength) throw new DamagedBundle('atlas.ktx2 is truncated.');
-  let texels = new Uint8Array(data, at, length);
-  if (scheme === 2) {
-    const { frameBytes } = await import('./zstd');
-    texels = frameBytes(texels, size * layers, 'atlas.ktx2') as Uint8Array<ArrayBuffer>;
-  } else if (scheme !== 0) {
-    throw new DamagedBundle(`atlas.ktx2 is compressed by a scheme (${scheme}) that is not known.`);
-  }
+  if (scheme !== 0) throw new DamagedBundle(`atlas.ktx2 is compressed by a scheme (${scheme}) that is not known.`);
+  const texels = new Uint8Array(data, at, length);
   if (texels.byteLength !== size * layers) throw new DamagedBundle('atlas.ktx2 has not the bytes of its texels.');
   const beyond = format === 'fp16' ? firstBeyond(texels, stated.alphaScale > 0) : -1;
   if (beyond >= 0) throw new DamagedBundle(`atlas.ktx2: texel ${beyond >> 2} is beyond the limits, or is no number.`);

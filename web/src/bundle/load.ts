@@ -66,7 +66,7 @@ export async function loadBundle(
   };
   const [, cameras, table, atlas] = await Promise.all([admit(info), views(), ...first.map(load)]);
   if (!info.compact) {
-    const pages = info.atlas ? await parseKtx2(atlas, info.atlas) : null;
+    const pages = info.atlas ? parseKtx2(atlas, info.atlas) : null;
     return { info, surfels: readSurfels(table, info), pages, later: null, cameras, photograph };
   }
   const { decodeSurfels, decodeTexels } = await import('./compact/decoder');

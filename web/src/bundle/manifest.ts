@@ -3,8 +3,14 @@ import { DamagedBundle, ViewerError } from '../errors';
 import type { Column } from './compact/columns';
 
 export const FORMAT = 'bitymi-bundle';
-export const NEWEST_MAJOR = 5;
-const CODED_MAJOR = 5; // entropy-coded columns
+export const NEWEST_MAJOR = 6;
+// Versions that are read as the newest, and the file of surfels that each had.
+const EARLIER: Record<string, string> = {
+  '1.4': 'surfels.ply',
+  '2.3': 'surfels.ply',
+  '4.0': 'surfels.ply',
+  '5.0': 'surfels.bin',
+};
 
 export type ViewKind = 'sv' | 'sh' | 'sb' | 'sg';
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
@@ -65,10 +71,6 @@ class Reader {
 
   private refuse(key: string, what: string): never {
     throw new DamagedBundle(`bundle.json: ${this.path}${key} must be ${what}.`);
-  }
-  // Reads the object under a key, whose own keys are numbers.
-  at(key: string): Reader {
-    return new Reader(this.value[key] as Json, `${this.path}${key}.`);
   }
   has(key: string): boolean {
     return this.value[key] !== undefined && this.value[key] !== null;
@@ -133,43 +135,36 @@ class Reader {
 const SIDE = 1 << 20;
 const MOST_COLUMNS = 64;
 const MOST_NUMBERS = 16; // per row of a column
-const MOST_BYTES = 7; // of a number that a double holds exactly
 const MOST_POINTS = 4096;
 const MOST_FILES = 1 << 14;
 const RATES = [1e-12, 1e12]; // pixels per unit of length
 
-function columns(r: Reader, coded: boolean): Column[] {
+function columns(r: Reader): Column[] {
   return r.parts('columns', MOST_COLUMNS).map((column) => ({
     name: column.text('name', /^[a-z0-9_]{1,20}$/),
     step: column.has('step') ? column.number('step', 1e-12, 1e6) : null,
-    bytes: coded ? column.wholes('bytes', MOST_NUMBERS, 0, 2 ** 40) : null,
-    low: coded ? [] : column.wholes('low', MOST_NUMBERS, -(2 ** 53), 2 ** 53),
-    planes: coded
-      ? []
-      : column.list('planes', MOST_NUMBERS).map((_, k) => {
-          return column.at('planes').wholes(`${k}`, MOST_BYTES, 1, 2 ** 40);
-        }),
+    bytes: column.wholes('bytes', MOST_NUMBERS, 0, 2 ** 40),
   }));
 }
 
-function compact(r: Reader, coded: boolean): CompactSurfels {
+function compact(r: Reader): CompactSurfels {
   const frame = r.part('frame');
   const [center, low] = [frame.point('center', 1e9), frame.point('low', 100)];
-  return { frame: { center, scale: frame.number('scale', 1e-300, 1e9), low }, columns: columns(r, coded) };
+  return { frame: { center, scale: frame.number('scale', 1e-300, 1e9), low }, columns: columns(r) };
 }
 
-function texels(r: Reader, coded: boolean, surfelBytes: number): CodedTexels {
+function texels(r: Reader, surfelBytes: number): CodedTexels {
   return {
     texels: r.whole('texels', 0, 2 ** 50),
     step: r.number('step', 1e-6, 100),
     pageWidth: r.whole('page_width', 1, SIDE),
     pageRows: r.whole('page_rows', 1, SIDE),
-    columns: columns(r, coded),
+    columns: columns(r),
     surfelBytes,
   };
 }
 
-function atlas(r: Reader, isCompact: boolean, coded: boolean, surfelBytes: number): Atlas {
+function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
   const format = r.choice('format', isCompact ? ['dct'] : ['bc7', 'uint8', 'fp16']);
   return {
     format,
@@ -180,7 +175,7 @@ function atlas(r: Reader, isCompact: boolean, coded: boolean, surfelBytes: numbe
     offset: r.number('offset', -256, 256),
     scale: r.number('scale', 0, 512),
     alphaScale: r.has('alpha_scale') ? r.number('alpha_scale', 1e-6, 2) : 0,
-    coded: isCompact ? texels(r, coded, surfelBytes) : null,
+    coded: isCompact ? texels(r, surfelBytes) : null,
   };
 }
 
@@ -234,21 +229,21 @@ export function parseManifest(text: string): Manifest {
       .map(([name, r]) => [name, { bytes: r.whole('bytes', 0, 2 ** 36), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
   );
   const isCompact = files.has('surfels.bin');
-  const coded = major >= CODED_MAJOR;
-  const texture = root.has('atlas')
-    ? atlas(root.part('atlas'), isCompact, coded, files.get('surfels.bin')?.bytes ?? 0)
-    : null;
-  if (coded && !isCompact) throw new DamagedBundle('bundle.json: version 5 has surfels.bin.');
-  if (!coded && Boolean(texture?.alphaScale) !== (major === 4)) {
-    throw new DamagedBundle('bundle.json: atlas.alpha_scale must be stated in version 4, and in no earlier one.');
+  if (major < NEWEST_MAJOR && EARLIER[version] !== (isCompact ? 'surfels.bin' : 'surfels.ply')) {
+    throw new ViewerError(
+      'This bundle is of a version that is read no longer',
+      `It has version ${version}.`,
+      'Export it again.',
+    );
   }
+  const texture = root.has('atlas') ? atlas(root.part('atlas'), isCompact, files.get('surfels.bin')?.bytes ?? 0) : null;
   if (render.has('prefilter')) render.choice('prefilter', ['low_pass']); // others are drawn no longer
   return {
     version,
     count: surfels.whole('count', 0, 2 ** 28),
     viewColor: surfels.choice('view_color', ['sv', 'sh', 'sb', 'sg']),
     terms: surfels.has('terms') || isCompact ? surfels.whole('terms', 0, 2 ** 31) : null,
-    compact: isCompact ? compact(surfels, coded) : null,
+    compact: isCompact ? compact(surfels) : null,
     atlas: texture,
     near: render.number('near', 1e-9, 1e6),
     weightBound: render.number('weight_bound', 0, 1),

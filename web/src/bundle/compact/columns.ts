@@ -1,19 +1,16 @@
 // Integer columns: docs/baking.md, "Columns of integers".
 import { DamagedBundle } from '../../errors';
-import { frameBytes } from '../zstd';
 import { decodeIntegers } from './integers';
 
 export interface Column {
   name: string;
   step: number | null;
-  bytes: number[] | null; // of each number; null before version 5, whose columns have instead:
-  low: number[];
-  planes: number[][]; // sizes of Zstandard frames per number, lowest byte first
+  bytes: number[]; // of each number
 }
 
 export type Codes = Float64Array | Int32Array;
 
-const bytesOf = ({ bytes, planes }: Column): number => (bytes ?? planes.flat()).reduce((sum, size) => sum + size, 0);
+const bytesOf = ({ bytes }: Column): number => bytes.reduce((sum, size) => sum + size, 0);
 
 // Checks that the columns are as expected ([name, numbers per row]) and fill the file.
 export function checkColumns(columns: Column[], expected: [string, number][], size: number, file: string): void {
@@ -22,7 +19,7 @@ export function checkColumns(columns: Column[], expected: [string, number][], si
   if (names(found) !== names(wanted)) throw new DamagedBundle(`${file}: its columns are ${names(found)}.`);
   columns.forEach((column, k) => {
     const [name, numbers] = expected[k];
-    if ((column.bytes ?? column.low).length !== numbers || (!column.bytes && column.planes.length !== numbers)) {
+    if (column.bytes.length !== numbers) {
       throw new DamagedBundle(`${file}: the column ${name} needs ${numbers} numbers.`);
     }
   });
@@ -47,19 +44,9 @@ export class ColumnReader {
 
   // Reads the next column: an array of `rows` codes per number. blocks: as in decodeIntegers.
   read<T extends Codes>(rows: number, make: (rows: number) => T, blocks = 0): T[] {
-    const { bytes, low, planes } = this.columns[this.next++];
-    const sums = blocks && bytes && bytes.length > 1 ? new Uint8Array(rows) : null;
-    if (bytes) return bytes.map((size, number) => this.decode(size, make(rows), blocks, sums, number));
-    return low.map((least, k) => {
-      const codes = make(rows).fill(least) as T;
-      planes[k].forEach((size, plane) => {
-        const found = frameBytes(this.data.subarray(this.at, this.at + size), rows, this.file);
-        const weight = 256 ** plane;
-        for (let i = 0; i < rows; i++) codes[i] += weight * found[i];
-        this.at += size;
-      });
-      return codes;
-    });
+    const { bytes } = this.columns[this.next++];
+    const sums = blocks && bytes.length > 1 ? new Uint8Array(rows) : null;
+    return bytes.map((size, number) => this.decode(size, make(rows), blocks, sums, number));
   }
 
   // Decodes one number of all rows by decodeIntegers.

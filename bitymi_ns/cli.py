@@ -252,7 +252,7 @@ class Extras:
     """gaussians: gaussians.ply, in 3DGS's format; surfels: surfels.ply, the same with two scales (2DGS, Brush); usd:
     surfels.usdc, OpenUSD's surflets; mesh: mesh.glb, a textured quad per surfel."""
     frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's.
-    crop: Flag = False  # Leave out the surfels that notes.json hides; the files' PSNR is not measured then.
+    crop: Flag = False  # Leave out the surfels that notes.json hides.
     output: Path | None = None  # Folder to write; not given: beside the bundle, with its name and .extras.
     overwrite: Flag = False  # Replace an existing folder of extras.
 
@@ -264,19 +264,10 @@ class Extras:
         output = self.output or interchange.extras_folder(self.bundle)
         bundle = read_bundle(self.bundle, crop=self.crop)
         cameras = interchange.training_cameras(bundle)
-        held_out = [] if self.crop else interchange.read_held_out(self.bundle, bundle)
         removed = interchange.removal_line(self.kinds, output)
         with rich_progress() as progress:
-            written = interchange.write_extras(
-                bundle,
-                output,
-                self.kinds,
-                frame=self.frame,
-                cameras=cameras,
-                held_out=held_out,
-                overwrite=self.overwrite,
-                progress=progress,
-            )
+            how = {"frame": self.frame, "cameras": cameras, "overwrite": self.overwrite, "progress": progress}
+            written = interchange.write_extras(bundle, output, self.kinds, **how)
         say(f"Wrote {output}" + (bundle.hidden and f"; {bundle.hidden}"))
         if removed:
             say(removed)

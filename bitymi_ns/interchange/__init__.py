@@ -1,4 +1,4 @@
-"""Baked scenes for other programs, as 3D Gaussians and as textured meshes, with renderers to measure them."""
+"""Baked scenes for other programs, as 3D Gaussians and as textured meshes."""
 
 from bitymi_ns.interchange.extras import (
     Frame,
@@ -7,15 +7,14 @@ from bitymi_ns.interchange.extras import (
     removal_line,
     reserve_extras,
     summary_line,
+    training_cameras,
     write_extras,
 )
-from bitymi_ns.interchange.held_out import read_held_out, training_cameras
 
 __all__ = [
     "Frame",
     "Kind",
     "extras_folder",
-    "read_held_out",
     "removal_line",
     "reserve_extras",
     "summary_line",

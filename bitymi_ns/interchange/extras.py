@@ -1,26 +1,23 @@
 """Extras of a bundle, for other programs: Gaussians, flat Gaussians, OpenUSD surflets, and a textured mesh."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Literal
 
 import torch
-from torch import Tensor
 
 from bitymi_ns.bake.view_colors import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import complete_folder, reserved, write_errors_as
-from bitymi_ns.interchange.draw_quads import draw_quads
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.gaussians import Gaussians, gaussians_of, write_gaussians
 from bitymi_ns.interchange.glb import quads_glb, upright
 from bitymi_ns.interchange.quads import quads_of
 from bitymi_ns.interchange.recolor import recolored
-from bitymi_ns.interchange.splat import draw_gaussians
 from bitymi_ns.interchange.surfel_colors import SurfelColors, fit_colors, weighted_residuals
 from bitymi_ns.interchange.usd import check_usd, write_usd
 from bitymi_ns.progress import Progress, no_progress
@@ -28,8 +25,6 @@ from bitymi_ns.ranges import spread
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
-from bitymi_ns.train.losses import mean_psnr, psnr
-from bitymi_ns.train.views import View, at_size
 from bitymi_ns.trust import check_replaceable
 
 Kind = Literal["gaussians", "surfels", "usd", "mesh"]
@@ -44,23 +39,23 @@ DEFAULT: tuple[Kind, ...] = ("gaussians", "mesh")
 SUMMARY = "extras.json"
 SUFFIX = ".extras"  # suffix of the folder beside a bundle
 LEVEL = 0.15  # opacity at which the quads of a mesh end
-SEEN_SIDE, COLORED_SIDE, MEASURED_SIDE = 400, 800, 400
-"""Longer side in pixels of the images for visibility, for the colours of a mesh, and for measuring the files."""
-COLORED_VIEWS, MEASURED_VIEWS = 64, 4
-"""Maximum number of training views that colour a mesh, and of held-out views to measure the files on."""
+SEEN_SIDE, COLORED_SIDE = 400, 800  # longer side in pixels of the images for visibility, and for a mesh's colours
+COLORED_VIEWS = 64  # most training views that colour a mesh
 
 
 @dataclass(frozen=True)
 class ExtraFile:
-    """A written file and its quality."""
+    """A written file."""
 
     file: str  # name
     bytes: int  # size
     count: int  # Gaussians or quads
-    psnr: float | None  # dB on the held-out photographs, rendered as other programs do; None: without such
-    psnr_bundle: float | None  # dB of the bundle on the same views
-    views: int  # number of these views, scaled to `MEASURED_SIDE` pixels
     note: str = ""  # origin of the positions, unless 0
+
+
+def training_cameras(bundle: Bundle) -> Sequence[Camera]:
+    """List the cameras of the training photographs; empty if the bundle has no cameras.json."""
+    return [row.camera for row in bundle.cameras if not row.held_out]
 
 
 def extras_folder(bundle: Path) -> Path:
@@ -111,19 +106,16 @@ def write_extras(
     *,
     frame: Frame = "scene",
     cameras: Sequence[Camera] = (),
-    held_out: Sequence[View] = (),
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> dict[str, ExtraFile]:
-    """Write a folder with a file per kind and extras.json, which states their PSNR on held-out photographs. The folder
-    is complete or absent.
+    """Write a folder with a file per kind and extras.json, which states them. The folder is complete or absent.
 
     Args:
         bundle: on the CPU, texels decoded.
         frame: of the files: the scene's or the capture's, by the transform of bundle.json.
         cameras: of the training photographs, to fit colours to. Without cameras harmonics are fitted over the whole
             sphere, and a mesh keeps the surfels' colours.
-        held_out: held-out photographs, to measure the files on.
         overwrite: replace a folder of extras.
 
     Returns:
@@ -138,52 +130,40 @@ def write_extras(
     to = to_capture(bundle.info.world) if frame == "capture" else None
     note = to.note if to is not None else ""
     scene, background = bundle.scene, torch.tensor(bundle.info.render.background)
-    chosen = [held_out[i].to("cpu") for i in spread(len(held_out), MEASURED_VIEWS)]
-    views = [at_size(view, view.camera.within(MEASURED_SIDE), "cpu") for view in chosen]
     colors = _fitted_colors(scene, cameras, progress)
-
-    def picture(camera: Camera) -> Tensor:
-        return scene.render(camera, background).rgb
-
-    base = _psnr(picture, views, background)
     place = upright(up_of(bundle.info.world, to), None if to is None else to.origin)
 
     @cache
     def gaussians() -> Gaussians:
-        return gaussians_of(scene, colors.harmonics)
+        made = gaussians_of(scene, colors.harmonics)
+        return made if to is None else made.moved(to)
 
-    @cache
-    def gaussians_psnr(discs: bool) -> float | None:
-        splats = gaussians()
-        return _psnr(lambda camera: draw_gaussians(splats, camera, background, scene.near, discs), views, background)
-
-    def write(kind: Kind, path: Path) -> tuple[int, float | None]:
-        """Write a file; returns its number of Gaussians or quads, and its PSNR."""
+    def write(kind: Kind, path: Path) -> int:
+        """Write a file; returns its number of Gaussians or quads."""
         if kind == "mesh":
             return write_mesh(path)
-        placed = gaussians() if to is None else gaussians().moved(to)
         if kind == "usd":
-            write_usd(path, placed, place)
+            write_usd(path, gaussians(), place)
         else:
-            write_gaussians(path, placed, [note] if note else [], flat=kind == "surfels")
-        return len(placed), gaussians_psnr(discs=kind == "usd")
+            write_gaussians(path, gaussians(), [note] if note else [], flat=kind == "surfels")
+        return len(gaussians())
 
-    def write_mesh(path: Path) -> tuple[int, float | None]:
+    def write_mesh(path: Path) -> int:
         quads = quads_of(scene, colors.color, LEVEL)
         if not len(quads):
             raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
         chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
-        quads, count = recolored(quads, picture, chosen, scene.near, progress), len(quads)
+        quads = recolored(quads, lambda camera: scene.render(camera, background).rgb, chosen, scene.near, progress)
         path.write_bytes(quads_glb(quads if to is None else quads.moved(to), place))
-        return count, _psnr(lambda camera: draw_quads(quads, camera, background, scene.near), views, background)
+        return len(quads)
 
     written: dict[str, ExtraFile] = {}
     replaceable = partial(check_extras, kinds, folder, overwrite)
     with write_errors_as(folder, BundleError, ". Nothing was left behind"), complete_folder(folder, replaceable) as new:
         for kind in dict.fromkeys(kinds):
             path = new / FILES[kind]
-            count, value = write(kind, path)
-            written[kind] = ExtraFile(path.name, path.stat().st_size, count, value, base, len(views), note)
+            count = write(kind, path)
+            written[kind] = ExtraFile(path.name, path.stat().st_size, count, note)
         summary = {"frame": frame, "training_views": len(cameras)}
         summary |= {kind: asdict(each) for kind, each in written.items()}
         (new / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", "utf8")
@@ -192,10 +172,7 @@ def write_extras(
 
 def summary_line(written: ExtraFile) -> str:
     """Summarise a written file in one line."""
-    line = f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB" + (written.note and f"; {written.note}")
-    if written.psnr is None or written.psnr_bundle is None:
-        return line
-    return f"{line}; {written.psnr:.2f} dB in {written.views} held-out views, the bundle {written.psnr_bundle:.2f} dB"
+    return f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB" + (written.note and f"; {written.note}")
 
 
 def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
@@ -203,10 +180,3 @@ def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progr
     drawn = (scene.near, scene.weight_bound, progress, texel_alpha(scene))
     seen = visibility(scene.surfels, chosen, *drawn).seen
     return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
-
-
-def _psnr(draw: Callable[[Camera], Tensor], views: Sequence[View], background: Tensor) -> float | None:
-    """Compute the mean PSNR, dB, over the views; None without unmasked pixels."""
-    values = [psnr(draw(view.camera).clamp(0.0, 1.0), view.target(background, "cpu"), view.mask) for view in views]
-    mean = mean_psnr(values)
-    return round(mean, 4) if mean == mean else None

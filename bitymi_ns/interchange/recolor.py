@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.codec.pages import size_classes, texel_index
-from bitymi_ns.interchange.draw_quads import nearest_hits
+from bitymi_ns.interchange.quad_hits import nearest_hits
 from bitymi_ns.interchange.quads import Quads
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera

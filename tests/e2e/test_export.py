@@ -77,7 +77,7 @@ def test_extras_are_written_beside_the_bundle(trained: BitymiTrainerConfig, tmp_
     stated = json.loads((tmp_path / "b.extras" / "extras.json").read_text())
     assert stated["training_views"] > 2
     for kind in ("gaussians", "mesh"):
-        assert stated[kind]["views"] == 2 and 5 < stated[kind]["psnr"] < stated[kind]["psnr_bundle"] + 3
+        assert stated[kind]["count"] > 0 and stated[kind]["bytes"] > 0
 
 
 def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainerConfig], tmp_path: Path) -> None:

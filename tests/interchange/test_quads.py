@@ -8,14 +8,15 @@ import torch
 import trimesh
 
 from bitymi_ns.bundle import Bundle
-from bitymi_ns.interchange.draw_quads import _fetch, draw_quads, nearest_hits
 from bitymi_ns.interchange.glb import quads_glb, upright
+from bitymi_ns.interchange.quad_hits import _fetch, nearest_hits
 from bitymi_ns.interchange.quads import Quads, quads_of
 from bitymi_ns.interchange.recolor import recolored
 from bitymi_ns.ops.reference.render import texel
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.init import tangents
 from tests.interchange.glb import read_glb
+from tests.interchange.test_alpha import drawn
 
 LEVEL = 0.15
 
@@ -103,11 +104,11 @@ def two_squares() -> Quads:
 
 def test_the_nearest_quad_hides_the_others_but_for_its_holes(camera) -> None:
     view = camera(6.0, 64, 48)
-    image = draw_quads(two_squares(), view, torch.tensor([0.0, 0.0, 1.0]))
+    image = drawn(two_squares(), view)
     assert torch.allclose(image[24, 33], torch.tensor([200 / 255, 0.0, 0.0]))
     assert torch.allclose(image[24, 22], torch.tensor([0.0, 100 / 255, 0.0]))  # 32 - 60 / 5 = 20: within the hole
     assert torch.allclose(image[24, 50], torch.tensor([0.0, 100 / 255, 0.0]))
-    assert image[2, 2].tolist() == [0.0, 0.0, 1.0]
+    assert image[2, 2].tolist() == [0.0, 0.0, 0.0]
 
 
 def test_quads_that_reach_behind_the_camera_are_drawn_in_front_of_it(camera) -> None:
@@ -125,7 +126,7 @@ def test_a_mesh_takes_the_colours_of_pictures_where_it_is_seen(camera) -> None:
     quads, view = two_squares(), camera(6.0, 64, 48)
     wanted = torch.tensor([0.3, 0.4, 0.5])
     again = recolored(quads, lambda c: wanted.expand(c.height, c.width, 3), [view] * 3, 0.2)
-    image = draw_quads(again, view)
+    image = drawn(again, view)
     assert torch.allclose(image[24, 33], wanted, atol=0.01) and torch.allclose(image[24, 50], wanted, atol=0.01)
     assert torch.equal(again.pages[..., 3], quads.pages[..., 3])
     assert torch.equal(recolored(quads, lambda c: wanted, [], 0.2).pages, quads.pages)

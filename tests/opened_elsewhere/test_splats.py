@@ -12,8 +12,8 @@ import torch
 
 from bitymi_ns.bundle.ply import parse_ply
 from bitymi_ns.interchange.gaussians import Gaussians, write_gaussians
-from tests.interchange.test_splat import gaussians
 from tests.opened_elsewhere.node import MODULES, said_by
+from tests.opened_elsewhere.splat import gaussians
 from tests.required import skip_without
 
 COUNT = 100

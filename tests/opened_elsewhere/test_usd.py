@@ -11,7 +11,7 @@ from bitymi_ns.interchange import extras, write_extras
 from bitymi_ns.interchange.gaussians import HARD_BETA
 from bitymi_ns.interchange.usd import write_usd
 from bitymi_ns.ops.constants import BETA_MAX
-from tests.interchange.test_splat import gaussians
+from tests.opened_elsewhere.splat import gaussians
 
 pxr = pytest.importorskip("pxr")
 KERNELS = ("gaussian_surflets", "constant_surflets")

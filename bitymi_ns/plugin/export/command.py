@@ -210,7 +210,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         if self.extras:
             folder = extras_folder(self.output_dir)
             how = {"frame": self.extras_frame, "overwrite": self.overwrite}
-            how |= {"cameras": [camera.to("cpu") for camera in views], "held_out": held_out}
+            how |= {"cameras": [camera.to("cpu") for camera in views]}
             removed = removal_line(self.extras, folder)
             with rich_progress() as progress:
                 written = write_extras(bundle, folder, self.extras, progress=progress, **how)

@@ -1,7 +1,5 @@
-"""Render 3D Gaussians as in 3DGS (elliptical weighted average, Zwicker et al. 2001), to measure previews.
-
-Simple rather than fast: torch on the CPU, one tile of the image at a time.
-"""
+"""3D Gaussians drawn as in 3DGS (elliptical weighted average, Zwicker et al. 2001), the reference for other programs'
+pictures; torch on the CPU, one tile of the image at a time."""
 
 import math
 
@@ -18,6 +16,22 @@ DILATION = 0.3  # added to the variances of a footprint, pixels squared
 REACH = 3.0  # radius of a footprint, in standard deviations along its longer axis
 BEYOND = 1.3  # limit on |x / z| and |y / z| in the Jacobian, in half images
 _AT_ONCE = 512
+
+
+def gaussians(count: int) -> Gaussians:
+    """Make random flat Gaussians."""
+    g = torch.Generator().manual_seed(3)
+    quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1)
+    scales = torch.cat([-2.0 + 0.7 * torch.randn(count, 2, generator=g), torch.full((count, 1), -16.0)], 1)
+    opacity = 2 * torch.randn(count, generator=g)
+    return Gaussians(
+        1.2 * torch.randn(count, 3, generator=g),
+        quats,
+        scales,
+        opacity,
+        0.3 * torch.randn(count, 16, 3, generator=g),
+        torch.arange(count) % 2 == 0,
+    )
 
 
 @torch.no_grad()

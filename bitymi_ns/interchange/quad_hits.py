@@ -1,7 +1,4 @@
-"""Renderer of quads with depth buffer, alpha mask and bilinear texture fetch without mip levels, to measure meshes.
-
-Simple rather than fast: torch on the CPU.
-"""
+"""Nearest quads of a mesh at the pixels of a view, by a depth buffer with alpha mask; torch on the CPU."""
 
 import math
 from collections.abc import Iterator
@@ -12,35 +9,8 @@ from torch import Tensor
 
 from bitymi_ns.interchange.quads import MASK, Quads
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.sampling import averaged
 
-SAMPLES = 2  # samples per pixel along each axis, like a viewer's 4x antialiasing
 _AT_ONCE = 1 << 19  # pairs of quads and pixels per batch
-
-
-@torch.no_grad()
-def draw_quads(quads: Quads, camera: Camera, background: Tensor | None = None, near: float = 0.2) -> Tensor:
-    """Render a view.
-
-    A ray r through a sample, with r_z = 1, meets the plane of a quad of corner A and sides E, F (camera frame) where
-    z r = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with n = E x F.
-
-    Args:
-        quads: in the camera's world frame.
-        camera: of an H x W view.
-        background: [3]; None: black.
-        near: near plane.
-
-    Returns:
-        [H, W, 3] float32.
-    """
-    fine = camera.scaled(SAMPLES)
-    image = torch.zeros(fine.height * fine.width, 3)
-    if background is not None:
-        image[:] = background
-    hits = nearest_hits(quads, fine, near)
-    image[hits.pixel] = hits.color
-    return averaged({"rgb": image.view(1, fine.height, fine.width, 3)}, SAMPLES)["rgb"][0]
 
 
 @dataclass(frozen=True)
@@ -55,7 +25,15 @@ class QuadHits:
 
 @torch.no_grad()
 def nearest_hits(quads: Quads, camera: Camera, near: float) -> QuadHits:
-    """Find the nearest quad at each pixel; see `draw_quads`."""
+    """Find the nearest quad at each pixel.
+
+    A ray r through a pixel, with r_z = 1, meets the plane of a quad of corner A and sides E, F (camera frame) where
+    z r = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with n = E x F.
+
+    Args:
+        quads: in the camera's world frame.
+        near: near plane, camera z.
+    """
     K, viewmat = camera.K.double(), camera.viewmat.double()
     corners = quads.corners.double() @ viewmat[:3, :3].T + viewmat[:3, 3]  # [Q, 4, 3]
     low, size, rows = _boxes(corners, K, near, camera.width, camera.height)

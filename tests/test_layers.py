@@ -28,7 +28,7 @@ BESIDE = [
     "trust",
 ]
 """Modules beside the layers (ORDER, innermost first); these import no layer."""
-KNOW_NERFSTUDIO = ("plugin", "host", "measure/pictures.py")
+KNOW_NERFSTUDIO = ("plugin", "measure/pictures.py")
 
 
 def name_of(path: Path) -> str:

@@ -106,11 +106,11 @@ def _with_members(union: Any, more: Sequence[Any]) -> Any:
 
 
 def find_config() -> None:
-    """Take a folder's config.yml, and stop before nerfstudio loads what is none as YAML.
+    """Take a folder's config.yml, and stop before nerfstudio loads what is none as YAML, or one of classes that are gone.
 
     Changes: --load-config in `sys.argv`, when the plugin is loaded. For: commands with that option but MESH_COMMAND,
-    which reads bundles without config.yml. Without: tracebacks of folders, missing files and binary data. Superfluous
-    once nerfstudio reports an unreadable config.yml.
+    which reads bundles without config.yml. Without: tracebacks of folders, missing files, binary data and modules.
+    Superfluous once nerfstudio reports an unreadable config.yml.
     """
     i, path = _given_config()
     if path is None or MESH_COMMAND in sys.argv[1:2]:
@@ -122,6 +122,8 @@ def find_config() -> None:
     config = path / CONFIG if path.is_dir() else path
     if not config.is_file():
         fail(f"there is no {config}: give the {CONFIG} of a run (ns-train says where it is) or of a bundle.")
+    if b"bitymi_ns.host." in config.read_bytes():
+        fail(f"{config} is of an early version, whose modules bitymi_ns.host are gone: train or export the scene again.")
     if config != path:
         sys.argv[i] = f"--load-config={config}" if "=" in sys.argv[i] else str(config)
 

@@ -92,7 +92,7 @@ class LearningRates:
     mean_pixels: tuple[Positive, Positive] = (0.07, 0.0007)
     """Positions, in pixels: a pixel's side at the surfel, in the nearest view that contains it."""
     means: tyro.conf.Suppress[tuple[Positive, Positive] | None] = None
-    """Positions, in scene extents, for runs recorded before steps were in pixels; replaces `mean_pixels`."""
+    """Positions, in scene extents, instead of `mean_pixels`: in the polish of a bake alone."""
     quats: NonNegative = 1e-3  # Rotations.
     log_scales: NonNegative = 5e-3  # Logarithms of the tangent scales.
     opacity_logits: NonNegative = 0.025  # Opacities, as logits.

@@ -73,16 +73,6 @@ def held_back(count: int, most: int, config: TrainConfig) -> str:
     )
 
 
-def recorded_rules(config: TrainConfig) -> list[str]:
-    """Name the rules of earlier versions that the recorded options select."""
-    if config.lr.means is None:
-        return []
-    return [
-        "Positions move in shares of the scene's extent, as the recorded lr.means asks for; a new run moves them in "
-        "pixels of the photographs (lr.mean_pixels)."
-    ]
-
-
 def recorded(config: TrainConfig) -> str:
     """Serialise the training options as JSON for a checkpoint."""
     return json.dumps(asdict(config), sort_keys=True)

@@ -31,7 +31,7 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
     np.testing.assert_array_equal(loaded.scene.tiles.numpy(), tiles)
     assert loaded.scene.tiles.dtype == torch.int32
     torch.testing.assert_close(loaded.scene.surfels["log_scales"], params["log_scales"], rtol=0, atol=0)
-    stated = dict(near=0.3, weight_bound=0.02, low_pass=1.0, prefilter=None, photographed=None)
+    stated = dict(near=0.3, weight_bound=0.02, low_pass=1.0, photographed=None)
     limits = dict(alpha_max=0.99, alpha_min=1 / 255, t_min=1e-4, background=(1, 0.5, 0))
     assert loaded.info.render.model_dump() == stated | limits
     if format is None:

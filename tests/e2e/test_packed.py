@@ -74,6 +74,10 @@ def test_nerfstudios_commands_name_the_command(
 ) -> None:
     monkeypatch.setattr(sys, "argv", [*command, "--load-config", str(copied / "config.yml")])
     find_config()
+    text = (copied / "config.yml").read_text()
+    (copied / "config.yml").write_text(text.replace("bitymi_ns.plugin.run.", "bitymi_ns.host."))
+    with pytest.raises(InputError, match="config.yml is of an early version, whose modules bitymi_ns.host are gone"):
+        find_config()
     (copied / "config.yml").unlink()
     for given in (packed, packed / "config.yml", copied / "config.yml"):
         monkeypatch.setattr(sys, "argv", [*command, f"--load-config={given}"])

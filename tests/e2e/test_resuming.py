@@ -11,14 +11,12 @@ from typing import Any
 
 import pytest
 import torch
-import yaml
 from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.plugin.run.trainer import BitymiTrainer
-from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.step import Training
 from tests.captures import edit
 from tests.e2e.runs import Start, a_run_of, checkpoint, different
@@ -187,23 +185,3 @@ def test_checkpoints_that_are_missing_or_damaged(trained: BitymiTrainerConfig, s
     torch.save(state, config.load_dir / "step-000000059.ckpt")
     with pytest.raises(InputError, match="optimizers.quats.state.0.exp_avg has to be float32"):
         ns_train.main(config)
-
-
-def test_a_recorded_configuration_with_rates_in_shares_of_the_extent_keeps_its_rule(
-    trained: BitymiTrainerConfig, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = start(name="earlier")
-    lr, texels = (vars(part) for part in (config.pipeline.model.train.lr, config.pipeline.model.train.texels))
-    del lr["mean_pixels"], texels["mean_rates"]  # absent in earlier versions
-    lr["means"] = (1.6e-4, 1.6e-6)
-    (tmp_path / "earlier.yml").write_text(yaml.dump(config))
-    config = yaml.load((tmp_path / "earlier.yml").read_text(), Loader=yaml.Loader)
-    config.load_dir, config.load_step, config.max_num_iterations = trained.get_checkpoint_dir(), 20, 23
-    ns_train.main(config)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "Positions move in shares of the scene's extent" in said
-    assert "Resumed with other options than were recorded" in said and "lr.means [0.00016, 1.6e-06] (was None)" in said
-    rate, extent = checkpoint(config, 22)["optimizers"]["means"]["param_groups"][0]["lr"], 1.0
-    assert rate == pytest.approx(
-        Schedule(config.pipeline.model.train, 23, extent, texels=True).lr("means", 22), rel=0.5
-    )

@@ -2,7 +2,7 @@
 
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train import messages
-from bitymi_ns.train.config import DensifyConfig, LearningRates, TrainConfig
+from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.init import PointReport
 from bitymi_ns.train.schedules import Schedule
 
@@ -56,9 +56,3 @@ def test_a_resumed_run_names_the_options_that_differ() -> None:
     (sentence,) = messages.other_options(record, other)
     assert "densify.max-surfels 800 (was 0)" in sentence and "exposure gain (was auto)" in sentence
     assert "quats" not in sentence
-
-
-def test_rules_of_earlier_versions_are_named() -> None:
-    assert messages.recorded_rules(TrainConfig()) == []
-    (sentence,) = messages.recorded_rules(TrainConfig(lr=LearningRates(means=(1.6e-4, 1.6e-6))))
-    assert "shares of the scene's extent" in sentence and "lr.means" in sentence

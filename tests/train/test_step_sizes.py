@@ -142,7 +142,7 @@ def test_texels_keep_the_picture_of_a_scene_with_a_large_extent(
         assert losses["extent"][1] < after - 1.0
 
 
-def test_recorded_rates_in_shares_of_the_extent_keep_their_rule(make_scene, views: list[View]) -> None:
+def test_rates_in_shares_of_the_extent_are_those_of_the_polish(make_scene, views: list[View]) -> None:
     rates = LearningRates(means=(1.6e-4, 1.6e-6))
     trainer = Trainer(make_scene(), views, TrainConfig(lr=rates), 100)
     trainer.advance()

@@ -79,7 +79,6 @@ class TrainingRun:
         self._held_back = False  # densification has met its bound, and a warning said so
         for sentence in (
             *messages.other_options(model.recorded_options, config),
-            *messages.recorded_rules(config),
             *messages.short_run(self.training.schedule, len(train), scene.config.texture == "hash", processes.views),
         ):
             say(sentence)

@@ -116,7 +116,8 @@ class BitymiTrainerConfig(TrainerConfig):
                 check_ranges(options)
             except ValueError as error:
                 fail(f"an option is out of range (--pipeline.model.*): {error}", error)
-        checkpoints.check_removed(vars(self.pipeline.model.scene), "the configuration")
+        model = self.pipeline.model
+        checkpoints.check_removed("the configuration", vars(model.scene), vars(model.train.lr))
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
                 option = f"--{name.replace('_', '-')} True"

@@ -107,16 +107,24 @@ def test_a_whole_checkpoint_loads(saved: Path) -> None:
     refused(saved, "another preset:\n  --pipeline.model.scene.view-color: sv there, sh here", SceneConfig("sh"))
 
 
-@pytest.mark.parametrize("prefilter", ["low_pass", "pixel"])
-def test_surfels_are_drawn_as_they_were_trained(saved: Path, prefilter: str) -> None:
+@pytest.mark.parametrize(
+    "entry, recorded, message",
+    [
+        ("scene", {"prefilter": "low_pass"}, ""),
+        ("scene", {"prefilter": "pixel"}, "asks for scene.prefilter pixel, which is gone: train the scene again"),
+        ("train", {"lr": {"means": None}}, ""),
+        ("train", {"lr": {"means": [1e-4, 1e-6]}}, "asks for train.lr.means .* which is gone: train the scene again"),
+    ],
+)
+def test_recorded_options_that_are_gone_are_refused(saved: Path, entry: str, recorded: dict, message: str) -> None:
     whole = state(SceneConfig())
     extra = whole["pipeline"]["_model._extra_state"]
-    extra["scene"] = json.dumps({**json.loads(extra["scene"]), "prefilter": prefilter})
+    extra[entry] = json.dumps({**json.loads(extra[entry]), **recorded})
     torch.save(whole, saved)
-    if prefilter == "low_pass":
-        checkpoints.load(saved, SceneConfig())
+    if message:
+        refused(saved, message)
     else:
-        refused(saved, "asks for scene.prefilter pixel, which is gone: train the scene again")
+        checkpoints.load(saved, SceneConfig())
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])

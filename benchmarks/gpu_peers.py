@@ -120,14 +120,8 @@ def activated(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def train(
     gsplat: Any, capture: SplitCapture, most: int, steps: int, device: torch.device
 ) -> tuple[dict[str, Tensor], float]:
-    """Train Gaussians on a capture with gsplat's MCMC strategy, which refines in the first 25/30 of the steps.
-
-    Args:
-        most: maximum number of Gaussians.
-
-    Returns:
-        The Gaussians, as in `activated`, and seconds of training.
-    """
+    """Train Gaussians on a capture with gsplat's MCMC strategy, which refines in the first 25/30 of the steps. `most`:
+    maximum number of Gaussians. Returns the Gaussians, as in `activated`, and seconds of training."""
     extent = scene_extent(torch.stack([view.camera.center for view in capture.train]), capture.points)
     parameters = torch.nn.ParameterDict(
         {name: torch.nn.Parameter(value.to(device)) for name, value in first_gaussians(capture, most, extent).items()}

@@ -73,11 +73,8 @@ def read_header(path: Path) -> Header:
 
 
 def parse_header(data: bytes | bytearray) -> Header:
-    """Parse the header from a file's contents, or its first `HEADER_LIMIT` bytes.
-
-    Raises:
-        PlyError: there is no header, or it is malformed.
-    """
+    """Parse the header from a file's contents, or its first `HEADER_LIMIT` bytes. Raises PlyError: there is no header,
+    or it is malformed."""
     end = _END.search(data, 0, HEADER_LIMIT)
     if not _MAGIC.match(data) or end is None:
         raise PlyError("not a PLY file")
@@ -126,11 +123,8 @@ def _row(properties: dict[str, str | None], order: str) -> np.dtype | None:
 
 
 def read_rows(path: Path, header: Header, name: str) -> npt.NDArray[np.void]:
-    """Read the rows of an element, [count], a field per property.
-
-    Raises:
-        PlyError: the element or a binary element before it has lists, rows are missing, or a line of text is malformed.
-    """
+    """Read the rows of an element, [count], a field per property. Raises PlyError: the element or a binary element
+    before it has lists, rows are missing, or a line of text is malformed."""
     element, ahead = header.elements[name], header.ahead(name)
     if element.row is None or ahead is None:
         raise PlyError(f"the rows of the element {name} have lists, or stand behind some")

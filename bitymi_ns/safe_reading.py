@@ -23,11 +23,8 @@ MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs 
 
 def open_regular(path: Path) -> BinaryIO:
     """Open a regular file for reading, also through a link. A folder, pipe or device is refused before it is opened:
-    opening a pipe blocks.
-
-    Raises:
-        OSError: the file does not exist, is not regular, or cannot be opened; `strerror` says which.
-    """
+    opening a pipe blocks. Raises OSError: the file does not exist, is not regular, or cannot be opened; `strerror` says
+    which."""
     try:
         found = os.stat(path)
     except ValueError:  # a null character
@@ -42,11 +39,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_bytes(path: Path, most: int = MOST_TEXT) -> bytes:
-    """Read a file of at most `most` bytes.
-
-    Raises:
-        OSError: it is no regular file, larger, or cannot be read.
-    """
+    """Read a file of at most `most` bytes. Raises OSError: it is no regular file, larger, or cannot be read."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         _check_size(path, size, most)
@@ -62,12 +55,8 @@ def open_text(path: Path, errors: str = "strict") -> TextIO:
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
-    """Read a text file of at most `most` bytes, see `open_text`.
-
-    Raises:
-        OSError: it is no regular file, larger, or cannot be read.
-        UnicodeDecodeError: it is no text.
-    """
+    """Read a text file of at most `most` bytes, see `open_text`. Raises OSError: it is no regular file, larger, or
+    cannot be read. Raises UnicodeDecodeError: it is no text."""
     with open_text(path) as file:
         _check_size(path, os.fstat(file.fileno()).st_size, most)
         return file.read()
@@ -79,12 +68,7 @@ def _check_size(path: Path, size: int, most: int) -> None:
 
 
 def read_json(path: Path, most: int = MOST_TEXT) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        OSError: see `read_bytes`.
-        ValueError: it is no JSON, or is nested too deeply.
-    """
+    """Read a JSON file. Raises OSError: see `read_bytes`. Raises ValueError: it is no JSON, or is nested too deeply."""
     return json_of(read_bytes(path, most))
 
 

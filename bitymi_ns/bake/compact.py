@@ -64,11 +64,8 @@ class Compact:
 
     def fitting(self, megabytes: float, beside: int) -> "Compact":
         """Limit all files to `megabytes` (10^6 bytes), of which others than surfels, texels, poster, bundle.json and
-        config.yml take `beside` bytes.
-
-        Raises:
-            ValueError: the limit is out of range, or nothing is left for surfels and texels.
-        """
+        config.yml take `beside` bytes. Raises ValueError: the limit is out of range, or nothing is left for surfels and
+        texels."""
         if not 0.01 <= megabytes <= 1e5:
             raise ValueError(f"a bundle takes from 0.01 to 100,000 MB, not {megabytes}")
         size = int(1e6 * megabytes)

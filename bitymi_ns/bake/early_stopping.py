@@ -82,12 +82,8 @@ class EarlyStopping(Generic[S]):
 def evaluate(
     pictures: Iterable[tuple[Tensor, Tensor, Tensor | None]], count: int, progress: Progress = no_progress
 ) -> float:
-    """Average the PSNR, dB, over views with an unmasked pixel.
-
-    Args:
-        pictures: rendering and photograph [H, W, 3] of every view, and the mask of the pixels that count; made one by
-            one.
-    """
+    """Average the PSNR, dB, over views with an unmasked pixel. `pictures`: rendering and photograph [H, W, 3] of every
+    view, and the mask of the pixels that count; made one by one."""
     values = []
     for rgb, target, mask in pictures:
         values.append(psnr(rgb.clamp(0.0, 1.0), target, mask))

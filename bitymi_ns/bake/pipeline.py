@@ -31,11 +31,8 @@ from bitymi_ns.trust import listed
 @torch.no_grad()
 def trained_texels(scene: BakeableScene, options: BakeOptions) -> BakeState:
     """Bake a scene whose texels were trained: all of its tiles, view colours and drawable surfels; `prune_and_resample`
-    then drops what the options say. Without texels no surfel has a tile.
-
-    Raises:
-        ValueError: no surfel is left, an option is out of range, or the atlas would be too large.
-    """
+    then drops what the options say. Without texels no surfel has a tile. Raises ValueError: no surfel is left, an
+    option is out of range, or the atlas would be too large."""
     options.check()
     rows, left_out = drawable(scene.surfels)
     trained = len(scene.surfels["means"])

@@ -79,11 +79,8 @@ class ColumnNoise:
     def steps(self, lmbda: float) -> dict[str, float]:
         """Choose the steps at which one more bit per number of a column lowers the error by lambda per bit.
 
-        A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number.
-
-        Args:
-            lmbda: mean square error of the images per bit; 0 = unknown: take the reference steps.
-        """
+        A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number. `lmbda`:
+        mean square error of the images per bit; 0 = unknown: take the reference steps."""
         if lmbda == 0:
             return dict(REFERENCE)
         return {name: _step(name, lmbda * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}
@@ -93,12 +90,8 @@ class ColumnNoise:
 def column_noise(
     scene: BakedScene, sizes: npt.ArrayLike, pictures: Pictures, progress: Progress = no_progress
 ) -> ColumnNoise:
-    """Measure the image error of each column rounded alone, at its reference step.
-
-    Args:
-        scene: with lean view colours, on the CPU, of N surfels.
-        sizes: [N, 2] sides of the tiles, texels; (0, 0) = none.
-    """
+    """Measure the image error of each column rounded alone, at its reference step. `scene`: with lean view colours, on
+    the CPU, of N surfels. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none."""
     assert scene.extent is not None
     codes, order = code_surfels(scene.surfels, scene.view_color, sizes, scene.extent, REFERENCE)
     moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}

@@ -44,11 +44,8 @@ def drop_unseen(
     baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress
 ) -> tuple[BakeState, BakeInput]:
     """Leave out, and count, the surfels that cannot be drawn or stored and, if the options say so, those that no view
-    blends. Also returns the kept surfels and their visibility, on the cameras' device.
-
-    Raises:
-        ValueError: no surfel is left.
-    """
+    blends. Also returns the kept surfels and their visibility, on the cameras' device. Raises ValueError: no surfel is
+    left."""
     scene, device = baked.scene, device_of(cameras)
     rows, gone = drawable(scene.surfels)
     surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}

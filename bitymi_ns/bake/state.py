@@ -70,11 +70,8 @@ class BakeState:
     def of(
         cls, scene: BakeableScene, surfels: Mapping[str, Tensor], rows: Tensor, tiles: Tiles, options: BakeOptions
     ) -> BakeState:
-        """Create from surfels (rows [N] of `scene`) and their tiles, not encoded.
-
-        Raises:
-            ValueError: the atlas would be too large.
-        """
+        """Create from surfels (rows [N] of `scene`) and their tiles, not encoded. Raises ValueError: the atlas would be
+        too large."""
         baked = BakedScene(
             {name: value.cpu() for name, value in surfels.items()},
             kind_of(scene.surfels),

@@ -81,11 +81,8 @@ def moving_average(values: Tensor, cells: Tensor) -> Tensor:
     """Average values over a rectangle about every cell, whose size differs by tile.
 
     A rectangle that would reach beyond the grid is moved into it. With rectangles of one cell, values stay as they are.
-
-    Args:
-        values: [n, c, v, u].
-        cells: [n, 2] sides of the rectangles along u and v, cells, from 1 to the side of the grid.
-    """
+    `values`: [n, c, v, u]. `cells`: [n, 2] sides of the rectangles along u and v, cells, from 1 to the side of the
+    grid."""
     along_u, along_v = (_windows(values.shape[axis], cells[:, i]) for axis, i in ((3, 0), (2, 1)))
     across = torch.einsum("nij,ncvj->ncvi", along_u, values)
     return torch.einsum("nij,ncju->nciu", along_v, across)
@@ -102,13 +99,9 @@ def _windows(count: int, width: Tensor) -> Tensor:
 
 @torch.no_grad()
 def certified(baked: BakeState, cameras: Sequence[Camera]) -> BakeState:
-    """Certify a bake: measure the error of the stored residual colours against those before quantisation, as
-    training views see it, and state it in the statistics; alphas are not covered. A bake without texels, or without
-    a tolerance, is returned as it is.
-
-    Args:
-        baked: encoded, on the CPU.
-    """
+    """Certify a bake: measure the error of the stored residual colours against those before quantisation, as training
+    views see it, and state it in the statistics; alphas are not covered. A bake without texels, or without a tolerance,
+    is returned as it is. `baked`: encoded, on the CPU."""
     scene, options = baked.scene, baked.options
     if baked.atlas is None or options.tolerance == 0:
         return baked

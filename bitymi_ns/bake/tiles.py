@@ -129,11 +129,8 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     The error of a grid is (reconstruction - what the tile should hold) times the largest blending weight that a
     fragment has there, in 8-bit steps: its root mean square over the colour channels and over the part of the support
     that gets a residual. Grids are tried by their number of texels, starting with none (one constant colour). The first
-    within the tolerance is taken, the tile itself at the latest.
-
-    Args:
-        inputs: the surfels, and what the views see of them; their device does the work.
-    """
+    within the tolerance is taken, the tile itself at the latest. `inputs`: the surfels, and what the views see of them;
+    their device does the work."""
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
     device, parts, done = opacity.device, [], 0
     shown = TileVisibility(opacity, beta, tiles.extent.to(device), inputs.weight_bound)

@@ -154,12 +154,8 @@ class TuningViews(Sequence[TuningView]):
             yield image, chosen
 
     def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
-        """Render a view with texels, and apply its photograph's correction: [H, W, 3].
-
-        Args:
-            view: of this sequence.
-            texels: [T, 3], as the baked renderer shows them before any quantisation.
-        """
+        """Render a view with texels, and apply its photograph's correction: [H, W, 3]. `view`: of this sequence.
+        `texels`: [T, 3], as the baked renderer shows them before any quantisation."""
         assert self._projection is not None
         drawn = (self._projection, view.base, texels, self._texels.tiles)
         rgb = torch.cat([blended_image(part, *drawn, descent=descent)[:, :3] for part in view.lists])

@@ -42,11 +42,8 @@ class ColorChoices:
     choices: Sequence[tuple[Tensor, Tensor, Tensor]]
 
     def at(self, lmbda: float | None = None) -> dict[str, Tensor]:
-        """Choose the lean view colours of the least error + lambda x bits.
-
-        Args:
-            lmbda: squared error per bit, colours from 0 to 1; None = those within the tolerance.
-        """
+        """Choose the lean view colours of the least error + lambda x bits. `lmbda`: squared error per bit, colours from
+        0 to 1; None = those within the tolerance."""
         numbers = torch.arange(self.error.shape[1])
         if lmbda is None:
             count = torch.where(self.error.isfinite(), numbers, 0).amax(1)
@@ -62,11 +59,7 @@ class ColorChoices:
 
 
 def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
-    """Estimate the memory of `color_choices`, bytes.
-
-    Args:
-        most: lean terms of a surfel.
-    """
+    """Estimate the memory of `color_choices`, bytes. `most`: lean terms of a surfel."""
     entry = VIEW_COLORS[kind]
     numbers = range(most + 1) if entry.sites is not None else sorted({0, most})
     of_surfel = 4 * (most + 1) + sum(8 + 4 * (3 + entry.lean_width * number) for number in numbers)

@@ -85,14 +85,7 @@ def cameras_data(cameras: Iterable[CapturedCamera]) -> bytes:
 
 
 def parse_cameras(data: bytes | bytearray, path: Path) -> list[CapturedCamera]:
-    """Parse cameras.json.
-
-    Args:
-        path: path for messages.
-
-    Raises:
-        BundleError: malformed; names the first bad entry.
-    """
+    """Parse cameras.json. `path`: path for messages. Raises BundleError: malformed; names the first bad entry."""
     try:
         value = strict_json.loads(data)
     except ValueError as error:

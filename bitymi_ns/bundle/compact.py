@@ -54,11 +54,8 @@ def encode_surfels(
 def decode_surfels(
     info: Surfels, data: memoryview, has_alpha: bool = False, digest: Digest | None = None
 ) -> tuple[SurfelCodes, Codes, float, Codes | None]:
-    """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] if it has them.
-
-    Raises:
-        StreamError: the file is damaged, contradicts bundle.json, or holds a number out of range.
-    """
+    """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] if it has them. Raises
+    StreamError: the file is damaged, contradicts bundle.json, or holds a number out of range."""
     assert info.columns is not None and info.frame is not None
     names, numbers = _surfel_columns(info.view_color, has_alpha)
     steps = _check_columns(info.columns, names, numbers, (*REFERENCE, "residual"))
@@ -163,11 +160,8 @@ def decode_texels(
 
 
 def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
-    """Compute the layout of the tiles in pages, which follows from their sizes.
-
-    Raises:
-        StreamError: the pages differ from those in bundle.json.
-    """
+    """Compute the layout of the tiles in pages, which follows from their sizes. Raises StreamError: the pages differ
+    from those in bundle.json."""
     try:
         packing = pack(sizes.numpy(), info.page_width, info.page_rows)
     except ValueError as error:
@@ -179,22 +173,15 @@ def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
 
 
 def check_surfels_size(info: Surfels, size: int) -> None:
-    """Check the size of surfels.bin against bundle.json before reading.
-
-    Raises:
-        StreamError: they differ.
-    """
+    """Check the size of surfels.bin against bundle.json before reading. Raises StreamError: they differ."""
     _check_size(info.columns or [], size)
     if max(info.count, info.terms or 0) > SURFELS_PER_BYTE * size + SPARE_SURFELS:
         raise StreamError(f"{info.count} surfels with {info.terms} terms cannot be in {size} bytes")
 
 
 def check_texels_size(info: AtlasEntry, size: int, surfels: int) -> None:
-    """Check the size of texels.bin against bundle.json before reading; surfels.bin has `surfels` bytes.
-
-    Raises:
-        StreamError: they differ.
-    """
+    """Check the size of texels.bin against bundle.json before reading; surfels.bin has `surfels` bytes. Raises
+    StreamError: they differ."""
     _check_size(info.columns or [], size)
     if (
         max(info.texels or 0, info.width * info.height * info.layers)

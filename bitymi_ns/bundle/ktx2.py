@@ -151,11 +151,8 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
 
 
 def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
-    """Parse and check a file written by `write_ktx2`, without copying the texels.
-
-    Raises:
-        Ktx2Error: another kind of file, truncated, or contradictory.
-    """
+    """Parse and check a file written by `write_ktx2`, without copying the texels. Raises Ktx2Error: another kind of
+    file, truncated, or contradictory."""
     view = memoryview(data)
     header = read_header(view, len(view))
     size = layer_bytes(header.format, header.width, header.height)

@@ -39,11 +39,8 @@ class BundleError(ValueError):
 
 
 def check_file_name(name: str, source: str) -> None:
-    """Check that a name is a plain file name, so that no bundle reaches out of its folder.
-
-    Raises:
-        BundleError: it is not; names `source`.
-    """
+    """Check that a name is a plain file name, so that no bundle reaches out of its folder. Raises BundleError: it is
+    not; names `source`."""
     if not _is_file_name(name):
         raise BundleError(f"{source}: {short(name)} cannot be the name of a file of the bundle")
 
@@ -69,11 +66,8 @@ def points_text(points: Tensor) -> str:
 
 
 def points_of(text: str) -> Tensor:
-    """Decode the points [P, 4] float32 of `points_text`.
-
-    Raises:
-        PydanticCustomError: malformed, or a number is out of range.
-    """
+    """Decode the points [P, 4] float32 of `points_text`. Raises PydanticCustomError: malformed, or a number is out of
+    range."""
     try:
         data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
@@ -270,11 +264,8 @@ class Manifest(Part):
 
 
 def describe(info: Mapping[str, Any]) -> Manifest:
-    """Build the manifest of `info`; arrays become lists, non-finite numbers null.
-
-    Raises:
-        BundleError: a required value is missing, or one is out of range.
-    """
+    """Build the manifest of `info`; arrays become lists, non-finite numbers null. Raises BundleError: a required value
+    is missing, or one is out of range."""
     try:
         return Manifest.model_validate_json(strict_json.canonical(strict_json.plain(info)))
     except ValidationError as error:
@@ -282,23 +273,17 @@ def describe(info: Mapping[str, Any]) -> Manifest:
 
 
 def dump(manifest: Manifest) -> bytes:
-    """Serialise a manifest to bundle.json, with the digest of its contents.
-
-    Raises:
-        BundleError: `parse` would refuse a value.
-    """
+    """Serialise a manifest to bundle.json, with the digest of its contents. Raises BundleError: `parse` would refuse a
+    value."""
     info = describe(manifest.model_dump(mode="json", exclude={"digest"})).model_dump(mode="json")
     info["digest"] = strict_json.digest(info)
     return (json.dumps(info, indent=2, ensure_ascii=False) + "\n").encode()
 
 
 def parse(data: bytes, source: str = MANIFEST) -> Manifest:
-    """Parse bundle.json and check everything that readers rely on; unknown keys are kept and ignored.
-
-    Raises:
-        BundleError: not a bundle, a newer major version, a value missing or out of range, or a digest that does not
-            match the contents.
-    """
+    """Parse bundle.json and check everything that readers rely on; unknown keys are kept and ignored. Raises
+    BundleError: not a bundle, a newer major version, a value missing or out of range, or a digest that does not match
+    the contents."""
     try:
         info = strict_json.loads(data)
         if not isinstance(info, dict) or info.get("format") != FORMAT:

@@ -153,11 +153,7 @@ def _box(entry: OrientedBox) -> Box:
 
 
 def parse_notes(data: bytes, source: str = NOTES) -> Notes:
-    """Parse notes.json.
-
-    Raises:
-        NotesError: names the source, the entry and the fault.
-    """
+    """Parse notes.json. Raises NotesError: names the source, the entry and the fault."""
     try:
         given = strict_json.loads(data)
         stated = given.get("version") if isinstance(given, dict) else None
@@ -190,11 +186,8 @@ def _refusal(source: str, what: str) -> NotesError:
 
 
 def read_notes(parts: Parts) -> tuple[bytes, Notes] | None:
-    """Read and check a bundle's notes.json: bytes and contents; None if it has none.
-
-    Raises:
-        BundleError: unreadable, too large, or an entry is refused.
-    """
+    """Read and check a bundle's notes.json: bytes and contents; None if it has none. Raises BundleError: unreadable,
+    too large, or an entry is refused."""
     data = notes_data(parts)
     return None if data is None else (data, parse_notes(data, str(parts.bundle / NOTES)))
 
@@ -213,11 +206,8 @@ def hides(bundle: str | Path) -> bool:
 
 
 def notes_of(bundle: str | Path) -> bytes | None:
-    """Read a bundle's notes.json for copying; links out of the folder are refused.
-
-    Raises:
-        BundleError: as `read_notes`.
-    """
+    """Read a bundle's notes.json for copying; links out of the folder are refused. Raises BundleError: as
+    `read_notes`."""
     with parts_of(bundle, inside=True) as parts:
         found = read_notes(parts)
     return None if found is None else found[0]

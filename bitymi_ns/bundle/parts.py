@@ -62,11 +62,8 @@ def public_manifest(info: Manifest, data: bytes) -> bytes:
 
 
 def open_regular(path: Path) -> BinaryIO:
-    """Open a file of a bundle for reading with `safe_reading.open_regular`.
-
-    Raises:
-        BundleError: missing, not a regular file, or the system refuses it.
-    """
+    """Open a file of a bundle for reading with `safe_reading.open_regular`. Raises BundleError: missing, not a regular
+    file, or the system refuses it."""
     try:
         return safe_reading.open_regular(path)
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -99,11 +96,8 @@ class Parts:
 
     @contextmanager
     def opened(self, name: str) -> Iterator[tuple[BinaryIO, int]]:
-        """Open a file; yield it, at its beginning, and its size in bytes, at most so many of which may be read.
-
-        Raises:
-            BundleError: missing or unreadable.
-        """
+        """Open a file; yield it, at its beginning, and its size in bytes, at most so many of which may be read. Raises
+        BundleError: missing or unreadable."""
         path = self.bundle / name
         try:
             if self._file is not None:
@@ -132,11 +126,8 @@ class Parts:
         return size
 
     def read(self, name: str, most: int) -> bytes:
-        """Read a file of at most `most` bytes; the size is checked first.
-
-        Raises:
-            BundleError: missing, larger, or unreadable.
-        """
+        """Read a file of at most `most` bytes; the size is checked first. Raises BundleError: missing, larger, or
+        unreadable."""
         with self.opened(name) as (file, size):
             if size > most:
                 raise BundleError(f"{self.bundle / name} has {size} bytes, at most {most} are read")
@@ -208,11 +199,8 @@ def _read_directory(file: BinaryIO) -> tuple[dict[str, _Entry], int]:
 
 
 def notes_data(parts: Parts) -> bytes | None:
-    """Read notes.json, unchecked; None if there is none.
-
-    Raises:
-        BundleError: unreadable, or more than `NOTES_LIMIT` bytes.
-    """
+    """Read notes.json, unchecked; None if there is none. Raises BundleError: unreadable, or more than `NOTES_LIMIT`
+    bytes."""
     try:
         return parts.read(NOTES, NOTES_LIMIT)
     except MissingPart:
@@ -248,12 +236,8 @@ def _is_archive(path: Path) -> bool:
 
 
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
-    """Check that a bundle may be written to a folder.
-
-    Raises:
-        BundleError: it exists and `overwrite` is off; or it is not a bundle, or holds foreign files, or a notes.json
-            that cannot be carried over.
-    """
+    """Check that a bundle may be written to a folder. Raises BundleError: it exists and `overwrite` is off; or it is
+    not a bundle, or holds foreign files, or a notes.json that cannot be carried over."""
     folder = Path(folder)
     made = _replaced(folder) if (folder / MANIFEST).is_file() else None
     check_replaceable(folder, f"a bundle (it has no {MANIFEST})", made, overwrite, BundleError, "--overwrite True")
@@ -262,10 +246,7 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
 @contextmanager
 def reserved_bundle(folder: str | Path, overwrite: bool, tell: Tell = warnings.warn, then: str = "") -> Iterator[None]:
     """Lock the folder of a bundle for the block, before the work of baking it; `then` ends the message of an error.
-
-    Raises:
-        BundleError: as `check_target`, or the folder is in use or cannot be written.
-    """
+    Raises BundleError: as `check_target`, or the folder is in use or cannot be written."""
     folder = Path(folder)
     with ExitStack() as stack:
         with write_errors_as(folder, BundleError, then):
@@ -282,11 +263,7 @@ def _replaced(folder: Path) -> Iterator[str]:
 
 def files_of(folder: Path) -> list[str]:
     """List the files of a bundle of any version: bundle.json, the files it lists, config.yml, and cameras.json, which
-    the first versions of `bake_scene` did not list.
-
-    Raises:
-        BundleError: bundle.json is unreadable.
-    """
+    the first versions of `bake_scene` did not list. Raises BundleError: bundle.json is unreadable."""
     try:
         with parts_of(folder) as parts:
             listed = json_of(bytes(parts.read(MANIFEST, MANIFEST_LIMIT)))["files"]

@@ -134,11 +134,8 @@ def _cropped(bundle: Bundle, parts: Parts) -> Bundle:
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """Read bundle.json of a folder or single file, checked as far as possible without the other files.
-
-    Raises:
-        BundleError: missing, malformed or altered, or a value is out of range.
-    """
+    """Read bundle.json of a folder or single file, checked as far as possible without the other files. Raises
+    BundleError: missing, malformed or altered, or a value is out of range."""
     with parts_of(folder) as parts:
         return manifest_of(parts)
 
@@ -220,14 +217,8 @@ def _read_whole(file: BinaryIO, head: bytes, size: int, keep: bool, path: Path, 
 
 
 def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True) -> Bundle:
-    """Assemble a bundle from the results of `read_file`.
-
-    Args:
-        files: contents of the files of surfels, texels and cameras, by name.
-
-    Raises:
-        BundleError: malformed, or a value is out of range.
-    """
+    """Assemble a bundle from the results of `read_file`. `files`: contents of the files of surfels, texels and cameras,
+    by name. Raises BundleError: malformed, or a value is out of range."""
     render, atlas, points = info.render, info.atlas, info.render.photographed
     contents = _compact_contents if info.surfels.file == COMPACT_SURFELS else _ply_contents
     scene = BakedScene(

@@ -34,14 +34,8 @@ def write_single(bundle: str | Path, path: str | Path) -> SingleFile:
     """Write a bundle to one file, atomically: the files of the format that bundle.json lists, and notes.json.
 
     Nothing is deflated, sizes precede the parts, and bundle.json comes first: the beginning of the file tells where
-    everything lies, and each part is one byte range.
-
-    Args:
-        bundle: folder, or such a file.
-
-    Raises:
-        BundleError: no bundle, a file is missing or altered, or memory is insufficient.
-    """
+    everything lies, and each part is one byte range. `bundle`: folder, or such a file. Raises BundleError: no bundle, a
+    file is missing or altered, or memory is insufficient."""
     data, written = joined(bundle)
     with complete_file(Path(path), follow=True) as file:
         file.write(data)
@@ -54,11 +48,7 @@ def write_single(bundle: str | Path, path: str | Path) -> SingleFile:
 
 
 def is_single(path: Path) -> bool:
-    """Return True if a file is a bundle and may be replaced by one.
-
-    Raises:
-        BundleError: the system cannot read it.
-    """
+    """Return True if a file is a bundle and may be replaced by one. Raises BundleError: the system cannot read it."""
     try:
         read_manifest(path)
     except BundleError as error:

@@ -21,11 +21,8 @@ term (4 million), 67 per texel with its pages (17 million)."""
 
 
 def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
-    """Check the beginning of a file of surfels or texels against its size and bundle.json; other files pass.
-
-    Raises:
-        PlyError, Ktx2Error, StreamError: they differ.
-    """
+    """Check the beginning of a file of surfels or texels against its size and bundle.json; other files pass. Raises
+    PlyError, Ktx2Error, StreamError: they differ."""
     surfels, atlas = info.surfels, info.atlas
     if name == SURFELS:
         elements = ply.read_header(head, size).elements
@@ -58,11 +55,8 @@ def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
 
 
 def check_memory(bundle: Path, info: Manifest, name: str) -> None:
-    """Check that a file of surfels or texels fits into this machine's memory, before reading it.
-
-    Raises:
-        BundleError: states the memory needed.
-    """
+    """Check that a file of surfels or texels fits into this machine's memory, before reading it. Raises BundleError:
+    states the memory needed."""
     least, there = least_memory(info, name), machine_memory()
     if least > there:
         needs = f"{bundle / name} needs more memory than there is: its contents take at least {size_text(least)}"

@@ -11,11 +11,8 @@ from torch import Tensor
 
 
 def loads(data: bytes | bytearray) -> Any:
-    """Parse UTF-8 JSON.
-
-    Raises:
-        ValueError: not JSON, a duplicate key, NaN or infinity (also as 1e999), or nested too deeply.
-    """
+    """Parse UTF-8 JSON. Raises ValueError: not JSON, a duplicate key, NaN or infinity (also as 1e999), or nested too
+    deeply."""
     try:
         return json.loads(
             data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_constant, parse_float=_finite
@@ -25,11 +22,8 @@ def loads(data: bytes | bytearray) -> Any:
 
 
 def canonical(value: Any) -> bytes:
-    """Serialise a JSON value canonically: sorted keys, no white space, ASCII.
-
-    Raises:
-        ValueError: a number is not finite, or the value is nested too deeply.
-    """
+    """Serialise a JSON value canonically: sorted keys, no white space, ASCII. Raises ValueError: a number is not
+    finite, or the value is nested too deeply."""
     try:
         return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
     except RecursionError as error:

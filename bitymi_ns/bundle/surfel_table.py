@@ -62,13 +62,9 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
 
 
 def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDArray]:
-    """Convert a scene to the columns of surfels.ply, without the terms of lean view colours (`term_columns`).
-
-    Args:
-        scene: N surfels. Mean residuals are included in the colour that other viewers show; residuals and extents get
-            columns if present.
-        has_alpha: write mean alphas.
-    """
+    """Convert a scene to the columns of surfels.ply, without the terms of lean view colours (`term_columns`). `scene`:
+    N surfels. Mean residuals are included in the colour that other viewers show; residuals and extents get columns if
+    present. `has_alpha`: write mean alphas."""
     kind, surfels, tiles = scene.view_color, scene.surfels, scene.tiles.numpy()
     lean = "view_terms" in surfels
     surfels = {name: _plain(value) for name, value in surfels.items()}
@@ -124,11 +120,7 @@ def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: fl
 
 def first_fault(surfels: Mapping[str, Tensor], kind: str) -> str | None:
     """Describe the first number beyond its limit (`limits.LIMITS`), by column and row of surfels.ply; None if none.
-
-    Args:
-        surfels: parameters by name, including mean_residual.
-        kind: a name of `ops.VIEW_COLORS`.
-    """
+    `surfels`: parameters by name, including mean_residual. `kind`: a name of `ops.VIEW_COLORS`."""
     for name, values in surfels.items():
         bad = beyond(name, kind, values)
         if bad.any():

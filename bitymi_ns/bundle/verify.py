@@ -28,11 +28,8 @@ class Check:
 
 
 def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
-    """Check a bundle on its own: sizes and hashes of its files, formats, numbers, tiles.
-
-    Returns:
-        the bundle, None if unreadable, and the checks in order.
-    """
+    """Check a bundle on its own: sizes and hashes of its files, formats, numbers, tiles. Returns the bundle, None if
+    unreadable, and the checks in order."""
     try:
         with parts_of(folder) as parts:
             return _check_parts(parts)
@@ -88,11 +85,7 @@ def _format_world(frame: WorldEntry) -> str:
 
 
 def check_world(stated: WorldEntry, world: World) -> Check:
-    """Compare the frame in bundle.json with that of the training run.
-
-    Args:
-        stated: from bundle.json.
-    """
+    """Compare the frame in bundle.json with that of the training run. `stated`: from bundle.json."""
     wrong = []
     for key, found in world.described().items():
         value = getattr(stated, key)

@@ -95,11 +95,7 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
 
 
 def check_page(page_width: int, max_rows: int) -> None:
-    """Check the page size.
-
-    Raises:
-        ValueError: the width or the height is not allowed.
-    """
+    """Check the page size. Raises ValueError: the width or the height is not allowed."""
     if page_width < GRID or page_width & (page_width - 1):
         raise ValueError(f"the page width must be a power of two of at least {GRID}, not {page_width}")
     if max_rows < ROWS or max_rows % ROWS:

@@ -17,11 +17,8 @@ from bitymi_ns.scene.baked import BakedScene
 
 
 def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
-    """Group surfels by tile size (r_u, r_v), given as [N, 2].
-
-    Returns:
-        list of (r_u, r_v, rows [M] int64), sizes ascending, without surfels that have no tile.
-    """
+    """Group surfels by tile size (r_u, r_v), given as [N, 2]. Returns list of (r_u, r_v, rows [M] int64), sizes
+    ascending, without surfels that have no tile."""
     # one integer per pair: torch.unique over rows is many times slower
     keys, inverse = torch.unique((sizes[:, 0].long() << 32) + sizes[:, 1].long(), return_inverse=True)
     found = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
@@ -111,11 +108,7 @@ def paged_texels(texels: Tensor, packing: Packing, elsewhere: float = 0.0) -> Te
 
 def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
     """Return the alpha texels of a scene on its device, the mean alpha for a surfel without a tile; None if the scene
-    has no alpha.
-
-    Raises:
-        ValueError: the atlas exists only as BC7 blocks.
-    """
+    has no alpha. Raises ValueError: the atlas exists only as BC7 blocks."""
     alphas, device = scene.alphas(), scene.tiles.device
     if alphas is None and scene.mean_alpha is None:
         return None

@@ -80,12 +80,8 @@ def choose_range(
     """Choose the quantisation range of an atlas, shared by its three colour channels.
 
     sigma6: mean +- 6 standard deviations of a bootstrap sample (paper, Quantization). minmax: smallest to largest
-    value, nothing clipped. auto: the one with the smaller mean squared 8-bit error on the sample.
-
-    Args:
-        texels: [T, C] float32 texels of the tiles.
-        samples: size of the bootstrap sample, uniform over the texels, with replacement.
-    """
+    value, nothing clipped. auto: the one with the smaller mean squared 8-bit error on the sample. `texels`: [T, C]
+    float32 texels of the tiles. `samples`: size of the bootstrap sample, uniform over the texels, with replacement."""
     if len(texels) == 0:
         return Range(0.0, 1.0, rule if rule != "auto" else "sigma6")
     sample = texels[np.random.default_rng(seed).integers(0, len(texels), samples), :3]
@@ -177,10 +173,7 @@ def encode(
 
 def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: int) -> np.ndarray:
     """Decode an atlas's pages to stored texels [layers, height, width, 4]: uint8 for bc7 and uint8, float16 for fp16.
-
-    Raises:
-        ValueError: a page has the wrong number of bytes.
-    """
+    Raises ValueError: a page has the wrong number of bytes."""
     dtype = np.float16 if format == "fp16" else np.uint8
     pages = np.empty((len(payload), height, width, 4), dtype=dtype)
     for page, data in zip(pages, payload, strict=True):

@@ -65,12 +65,8 @@ def extras_folder(bundle: Path) -> Path:
 
 
 def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
-    """Check the kinds and the output folder.
-
-    Raises:
-        BundleError: a kind does not exist, or needs OpenUSD, which is not installed; or the folder exists and
-            `overwrite` is False, or it holds other files.
-    """
+    """Check the kinds and the output folder. Raises BundleError: a kind does not exist, or needs OpenUSD, which is not
+    installed; or the folder exists and `overwrite` is False, or it holds other files."""
     unknown = [kind for kind in kinds if kind not in FILES]
     if unknown or not kinds:
         what = f"there is no extra {unknown[0]!r}" if unknown else "no extra is asked for"

@@ -47,11 +47,8 @@ class Similarity:
 
 
 def to_capture(place: WorldEntry) -> Similarity:
-    """Invert x_scene = scale * (transform @ [x_capture, 1]).
-
-    Raises:
-        BundleError: the transform is no similarity, so that discs would not remain discs.
-    """
+    """Invert x_scene = scale * (transform @ [x_capture, 1]). Raises BundleError: the transform is no similarity, so
+    that discs would not remain discs."""
     transform = torch.tensor(place.transform, dtype=torch.float64)
     matrix, offset = transform[:, :3], transform[:, 3]
     stretch = float(torch.linalg.det(matrix).abs()) ** (1 / 3)

@@ -134,12 +134,8 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = (), flat: bool = False) -> None:
-    """Write Gaussians as a 3DGS PLY file.
-
-    Args:
-        comments: lines of the header.
-        flat: omit the third scales, and state so in a comment (`FLAT`).
-    """
+    """Write Gaussians as a 3DGS PLY file. `comments`: lines of the header. `flat`: omit the third scales, and state so
+    in a comment (`FLAT`)."""
     values = {
         "means": gaussians.means,
         "normals": torch.zeros_like(gaussians.means),

@@ -28,12 +28,8 @@ def upright(up: Tensor, origin: Tensor | None = None) -> np.ndarray:
 
 def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
     """Encode quads as glTF: a mesh per page with the page as PNG, two triangles per quad, double-sided and unlit
-    (KHR_materials_unlit). The sampler has no mip levels, which would mix tiles.
-
-    Args:
-        quads: at least one.
-        place: transform of the node, of `upright`.
-    """
+    (KHR_materials_unlit). The sampler has no mip levels, which would mix tiles. `quads`: at least one. `place`:
+    transform of the node, of `upright`."""
     scene = trimesh.Scene()
     for page in torch.unique(quads.page).tolist():
         rows = torch.nonzero(quads.page == page).squeeze(1)
@@ -52,12 +48,8 @@ def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
 
 
 def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> bytes:
-    """Encode a surface as glTF: a mesh with linear vertex colors, lit and double-sided.
-
-    Args:
-        normals: [V, 3] unit vertex normals.
-        place: transform of the node, of `upright`.
-    """
+    """Encode a surface as glTF: a mesh with linear vertex colors, lit and double-sided. `normals`: [V, 3] unit vertex
+    normals. `place`: transform of the node, of `upright`."""
     linear = np.where(mesh.colors <= 0.04045, mesh.colors / 12.92, ((mesh.colors + 0.055) / 1.055) ** 2.4)
     shape = trimesh.Trimesh(
         mesh.vertices,

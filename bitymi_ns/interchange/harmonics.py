@@ -16,14 +16,8 @@ def basis(directions: Tensor) -> Tensor:
     """Evaluate the harmonics in some directions.
 
     On the sphere they are linear combinations of the monomials of degrees 2 and 3. Their coefficients are solved for
-    from values of the compiled kernel, in float64, so that the formula exists once.
-
-    Args:
-        directions: [..., 3] unit vectors.
-
-    Returns:
-        [..., 16] in the dtype of the directions.
-    """
+    from values of the compiled kernel, in float64, so that the formula exists once. `directions`: [..., 3] unit
+    vectors. Returns [..., 16] in the dtype of the directions."""
     return _monomials(directions) @ _from_monomials().to(directions)
 
 

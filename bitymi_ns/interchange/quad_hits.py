@@ -27,13 +27,9 @@ class QuadHits:
 def nearest_hits(quads: Quads, camera: Camera, near: float) -> QuadHits:
     """Find the nearest quad at each pixel.
 
-    A ray r through a pixel, with r_z = 1, meets the plane of a quad of corner A and sides E, F (camera frame) where
-    z r = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with n = E x F.
-
-    Args:
-        quads: in the camera's world frame.
-        near: near plane, camera z.
-    """
+    A ray r through a pixel, with r_z = 1, meets the plane of a quad of corner A and sides E, F (camera frame) where z r
+    = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with n = E x F. `quads`: in the
+    camera's world frame. `near`: near plane, camera z."""
     K, viewmat = camera.K.double(), camera.viewmat.double()
     corners = quads.corners.double() @ viewmat[:3, :3].T + viewmat[:3, 3]  # [Q, 4, 3]
     low, size, rows = _boxes(corners, K, near, camera.width, camera.height)

@@ -27,12 +27,8 @@ def recolored(
 
     A surfel is blended with what is behind it; an opaque quad is not. So the colours of each quad are first shifted by
     their mean difference from the renders, over the quad's pixels; then each texel becomes the mean of its pixels. Both
-    means include the previous value with the weight of PRIOR pixels.
-
-    Args:
-        picture: renders the scene for a camera, [H, W, 3].
-        near: near plane.
-    """
+    means include the previous value with the weight of PRIOR pixels. `picture`: renders the scene for a camera, [H, W,
+    3]. `near`: near plane."""
     pages, height, width, _ = quads.pages.shape
     shift, shown = torch.zeros(len(quads), 3), torch.zeros(len(quads), 1)
     texels, count = torch.zeros(pages * height * width, 3), torch.zeros(pages * height * width, 1)

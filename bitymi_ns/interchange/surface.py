@@ -93,11 +93,8 @@ def median_depth(
 
 def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
     """Compute the box [2, 3] around the points of depth maps, without the outermost `QUANTILE` at each side, within
-    `REACH` times the larger of the cameras' extent and the median depth.
-
-    Raises:
-        NoSurface: there are no cameras, or no pixel has a depth.
-    """
+    `REACH` times the larger of the cameras' extent and the median depth. Raises NoSurface: there are no cameras, or no
+    pixel has a depth."""
     if not cameras:
         raise NoSurface("there are no cameras that see the surface")
     points = torch.cat([_points(depth, camera) for depth, camera in zip(depths, cameras, strict=True)])

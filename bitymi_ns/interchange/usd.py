@@ -12,11 +12,7 @@ from bitymi_ns.interchange.gaussians import Gaussians
 
 
 def check_usd() -> None:
-    """Check that OpenUSD can be imported and has surflets.
-
-    Raises:
-        BundleError: it cannot, or is too old.
-    """
+    """Check that OpenUSD can be imported and has surflets. Raises BundleError: it cannot, or is too old."""
     try:
         from pxr import UsdVol
 

@@ -20,12 +20,8 @@ def escaped(text: str) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: Sequence[int] = (0,)) -> str:
-    """Format a table, without a trailing newline.
-
-    Args:
-        rows: cells, which may contain markup.
-        text_columns: indices of left-aligned columns; the others are right-aligned.
-    """
+    """Format a table, without a trailing newline. `rows`: cells, which may contain markup. `text_columns`: indices of
+    left-aligned columns; the others are right-aligned."""
     rule = "".join("---|" if i in text_columns else "---:|" for i in range(len(header)))
     lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
     return "\n".join([lines[0], "|" + rule, *lines[1:]])
@@ -43,11 +39,8 @@ def _command_line() -> str:
 
 
 def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str] = ()) -> str:
-    """Format a section: title, command line, machine and commit, body, notes.
-
-    Args:
-        commits: at which the figures were measured; empty: that of this checkout.
-    """
+    """Format a section: title, command line, machine and commit, body, notes. `commits`: at which the figures were
+    measured; empty: that of this checkout."""
     measured = sorted(set(commits)) or [commit()]
     lines = [f"## {title}", "", f"`{_command_line()}`  ", f"{machine()}; {software()}  "]
     lines += [f"{datetime.date.today():%Y-%m-%d}, commit {', '.join(c or 'unknown' for c in measured)}", "", body]

@@ -26,14 +26,9 @@ _emulated = False
 
 @contextmanager
 def emulated_cuda(seed: int = 0) -> Iterator[None]:
-    """Send CPU tensors to the CUDA kernels, run thread by thread on the host. For tests.
-
-    Args:
-        seed: of the order in which the threads of a block run.
-
-    Raises:
-        RuntimeError: the package was built without BITYMI_EMULATED_CUDA (a CMake option).
-    """
+    """Send CPU tensors to the CUDA kernels, run thread by thread on the host. For tests. `seed`: of the order in which
+    the threads of a block run. Raises RuntimeError: the package was built without BITYMI_EMULATED_CUDA (a CMake
+    option)."""
     global _emulated
     before = _emulated
     load("_emulated").set_seed(seed)
@@ -49,11 +44,7 @@ def cpu_module() -> str:
     """Return the name of the best module of CPU kernels that this CPU can run.
 
     Checked before loading, as an unsupported instruction ends the process. Only Linux lists CPU features; elsewhere the
-    first module is used.
-
-    Raises:
-        KernelsUnavailable: this CPU lacks a feature that all modules need.
-    """
+    first module is used. Raises KernelsUnavailable: this CPU lacks a feature that all modules need."""
     try:
         needs = importlib.import_module("bitymi_ns._cpu_features").FEATURES
         lines = CPUINFO.read_text(encoding="utf8").splitlines()
@@ -75,11 +66,8 @@ def cpu_module() -> str:
 
 @functools.cache
 def load(name: str) -> ModuleType:
-    """Load a compiled module: _cpu, _cuda or _emulated. Starts no thread and changes no setting.
-
-    Raises:
-        KernelsUnavailable: missing, or not for this CPU.
-    """
+    """Load a compiled module: _cpu, _cuda or _emulated. Starts no thread and changes no setting. Raises
+    KernelsUnavailable: missing, or not for this CPU."""
     try:
         return importlib.import_module(f"bitymi_ns.{cpu_module() if name == '_cpu' else name}")
     except ImportError as error:
@@ -110,11 +98,7 @@ def cuda_backend(device: torch.device) -> bool:
 
 
 def module(device: torch.device) -> ModuleType:
-    """Return the kernel module for a device.
-
-    Raises:
-        RuntimeError: its kernels are not built, or not for this CPU.
-    """
+    """Return the kernel module for a device. Raises RuntimeError: its kernels are not built, or not for this CPU."""
     if device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")
     if cuda_backend(device):
@@ -140,11 +124,8 @@ def require(operation: str, kind: str, device: torch.device, instead: str) -> No
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:
     """Return a kernel function by name. It takes keyword arguments (csrc/ops) and, on a CUDA device, runs on torch's
-    current stream of that device.
-
-    Raises:
-        RuntimeError: the kernels for that device are not built, or lack the function.
-    """
+    current stream of that device. Raises RuntimeError: the kernels for that device are not built, or lack the
+    function."""
     compiled = getattr(module(device), name, None)
     if compiled is None:
         raise RuntimeError(f"there is no kernel {name} for tensors on '{device}': move them to another device")
@@ -175,12 +156,8 @@ def _name(name: str, like: Tensor) -> str:
 
 
 def kernel(name: str, like: Tensor) -> Callable[..., Any]:
-    """Return the kernel function `name` for tensors like `like`.
-
-    Raises:
-        TypeError: the dtype is neither float32 nor float64.
-        RuntimeError: the kernels for that device are not built.
-    """
+    """Return the kernel function `name` for tensors like `like`. Raises TypeError: the dtype is neither float32 nor
+    float64. Raises RuntimeError: the kernels for that device are not built."""
     return function(_name(name, like), like.device)
 
 
@@ -205,22 +182,14 @@ def on_device(device: torch.device) -> AbstractContextManager[Any]:
 
 
 def on_same_device(like: Tensor, **tensors: Tensor) -> None:
-    """Check that tensors are on the device of `like`.
-
-    Raises:
-        ValueError: names one that is not.
-    """
+    """Check that tensors are on the device of `like`. Raises ValueError: names one that is not."""
     for name, tensor in tensors.items():
         if tensor.device != like.device:
             raise ValueError(f"{name} is on device '{tensor.device}', it must be on '{like.device}'")
 
 
 def check_shapes(**shapes: tuple[Tensor, Sequence[int]]) -> None:
-    """Check the shapes of tensors, by name.
-
-    Raises:
-        ValueError: names one with another shape.
-    """
+    """Check the shapes of tensors, by name. Raises ValueError: names one with another shape."""
     for name, (tensor, shape) in shapes.items():
         if tuple(tensor.shape) != tuple(shape):
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")

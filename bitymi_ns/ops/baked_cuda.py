@@ -116,13 +116,9 @@ class Atlas(NamedTuple):
 
     @classmethod
     def of(cls, pages: Tensor, blocks: bool, device: torch.device) -> Atlas:
-        """Upload pages.
-
-        Args:
-            pages: [pages, height, width, 4] texels, or BC7 blocks [pages, height / 4, width / 4, 16], as `AtlasTexture`
-                takes them.
-            blocks: whether they are BC7 blocks; decoded, with a warning, if the device does not support them.
-        """
+        """Upload pages. `pages`: [pages, height, width, 4] texels, or BC7 blocks [pages, height / 4, width / 4, 16], as
+        `AtlasTexture` takes them. `blocks`: whether they are BC7 blocks; decoded, with a warning, if the device does
+        not support them."""
         pages = pages.detach().cpu()
         if blocks and not draws_blocks(device):
             pages, blocks = decoded(pages), False
@@ -220,11 +216,8 @@ class Workspace:
         self.memory: Tensor | None = None
 
     def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
-        """Allocate for such frames with at least `capacity` pairs, or the number that `frame_fitted` found.
-
-        Raises:
-            ValueError: more surfels, views or pairs than a frame can have; states the numbers.
-        """
+        """Allocate for such frames with at least `capacity` pairs, or the number that `frame_fitted` found. Raises
+        ValueError: more surfels, views or pairs than a frame can have; states the numbers."""
         kernels, device = module(self._device), self._device
         most = kernels.MOST_PAIRS
         if capacity > most:
@@ -271,11 +264,8 @@ def empty_images(names: Sequence[str], views: int, width: int, height: int, devi
 
 
 def stack_cameras(cameras: Sequence[CameraLike], device: torch.device) -> tuple[Tensor, Tensor, int, int]:
-    """Stack cameras of one size: viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, width and height.
-
-    Raises:
-        ValueError: no cameras, different sizes, or skew.
-    """
+    """Stack cameras of one size: viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, width and height. Raises
+    ValueError: no cameras, different sizes, or skew."""
     size = common_size(cameras)
     viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device, torch.float32)
     Ks = torch.stack([camera.K for camera in cameras]).to(device, torch.float32)

@@ -113,11 +113,7 @@ def packed(rgb: Tensor, alpha: Tensor) -> Tensor:
 
 
 def common_size(cameras: Sequence[CameraLike]) -> tuple[int, int]:
-    """Return the common width and height of views.
-
-    Raises:
-        ValueError: no views, different sizes, or skew.
-    """
+    """Return the common width and height of views. Raises ValueError: no views, different sizes, or skew."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     if len(sizes) != 1:
         raise ValueError(f"views that are drawn together need one size, not {sorted(sizes)}")

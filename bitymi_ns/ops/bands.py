@@ -60,14 +60,8 @@ class Bands:
 
 def fitting_lists(projection: Projection, most: int = 0, rim: float = 1e-3) -> Iterator[Fragments]:
     """Yield the fragments of a view for a single read: one list on a CUDA device, lists of some rows of tiles on the
-    CPU; smaller ones if a list has too many fragments.
-
-    Args:
-        most: largest number of fragments of a list, as in `trace`.
-
-    Raises:
-        TooManyFragments: a single row of tiles has too many.
-    """
+    CPU; smaller ones if a list has too many fragments. `most`: largest number of fragments of a list, as in `trace`.
+    Raises TooManyFragments: a single row of tiles has too many."""
     width, height = projection.camera.width, projection.camera.height
     parts = 1 if cuda_backend(projection.geom.device) else -(-width * height // PASSING)
 

@@ -41,11 +41,8 @@ def check_pair_count(pairs: int, camera: CameraLike) -> None:
 
 
 def tile_lists(geom: Tensor, projection: Projection) -> Bins:
-    """List the pairs of surfel and tile of a view; waits once for their number.
-
-    Raises:
-        RuntimeError: 2^31 pairs or more.
-    """
+    """List the pairs of surfel and tile of a view; waits once for their number. Raises RuntimeError: 2^31 pairs or
+    more."""
     require("bin_cuda.tile_lists", "cuda", geom.device, "call `trace`")
     camera, n, view = projection.camera, geom.shape[0], projection.view(geom)
     tiles = -(-camera.width // TILE) * -(-camera.height // TILE)

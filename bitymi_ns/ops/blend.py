@@ -20,12 +20,9 @@ def _no_tiles(surfels: int, dtype: torch.dtype, device: torch.device) -> TexelTi
 
 
 def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, Tensor]:
-    """Allocate working memory of the backward kernel by name; none on the CPU.
-
-    Args:
-        texels: number T of texels with a gradient. On CUDA a row of four numbers each; with deterministic algorithms
-            int64 sums instead, which do not depend on the order.
-    """
+    """Allocate working memory of the backward kernel by name; none on the CPU. `texels`: number T of texels with a
+    gradient. On CUDA a row of four numbers each; with deterministic algorithms int64 sums instead, which do not depend
+    on the order."""
     like = fragments.weight
     if not cuda_backend(like.device):
         return {}

@@ -21,12 +21,9 @@ PART = 1 << 20  # fragments summed at a time
 
 @torch.no_grad()
 def surfel_coverage(projection: Projection, bound: float) -> Tensor:
-    """Measure the coverage of each surfel in a view.
-
-    Returns:
-        [N, 3]: largest transmittance in front of a blended fragment; sum of blending weights >= `bound`, pixels; sum
-        of all squared blending weights, pixels. 0 for surfels that are not blended.
-    """
+    """Measure the coverage of each surfel in a view. Returns [N, 3]: largest transmittance in front of a blended
+    fragment; sum of blending weights >= `bound`, pixels; sum of all squared blending weights, pixels. 0 for surfels
+    that are not blended."""
     geom = projection.geom.detach()
     shown = geom.new_zeros(len(geom), 3)
     if not cuda_backend(geom.device):

@@ -26,11 +26,7 @@ class FieldGeometry:
 
 
 def kernel_field(geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor):
-    """Wrap the field's parameters for the kernels.
-
-    Raises:
-        ValueError: shapes do not match.
-    """
+    """Wrap the field's parameters for the kernels. Raises ValueError: shapes do not match."""
     levels, size, features = table.shape
     log2_size = size.bit_length() - 1
     if features != FEATURES or size != 1 << log2_size:

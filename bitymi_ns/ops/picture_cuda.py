@@ -46,12 +46,8 @@ class PhotographTarget:
                 raise ValueError(f"the picture is {list(size)}, its mask {mask}, not bool")
 
     def arguments(self, like: Tensor, correction: Tensor | None = None) -> dict[str, Any]:
-        """Build the kernels' arguments for a picture (`Picture` of csrc/cuda/training.h).
-
-        Args:
-            like: of the picture's dtype and device.
-            correction: of the photograph, [3] or [3, 4], see `train.views.View`; None: none.
-        """
+        """Build the kernels' arguments for a picture (`Picture` of csrc/cuda/training.h). `like`: of the picture's
+        dtype and device. `correction`: of the photograph, [3] or [3, 4], see `train.views.View`; None: none."""
         return {
             "target": dense(self.target, like),
             "mask": None if self.mask is None else self.mask.reshape(-1).contiguous().view(torch.uint8),

@@ -77,11 +77,7 @@ class Projection:
             self.whole.mean2d_absgrad += absgrad
 
     def view(self, geom: Tensor) -> dict[str, Any]:
-        """Build the kernels' arguments for a view (`View` of csrc/ops/visibility.h).
-
-        Args:
-            geom: `self.geom`, detached.
-        """
+        """Build the kernels' arguments for a view (`View` of csrc/ops/visibility.h). `geom`: `self.geom`, detached."""
         size = {"width": self.camera.width, "height": self.camera.height}
         drawn = {"near": self.near, "photo_pixel": self.photo_pixel}
         return dict(geom=geom, radii=self.radii, **size, **drawn)
@@ -186,11 +182,8 @@ def refuse_skew(camera: CameraLike) -> None:
 def checked_geometry(
     means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, beta_raw: Tensor, camera: CameraLike
 ) -> tuple[Tensor, ...]:
-    """Check the arguments of `project`; returns the surfels' in order.
-
-    Raises:
-        ValueError: shapes or devices do not match, or the camera has skew.
-    """
+    """Check the arguments of `project`; returns the surfels' in order. Raises ValueError: shapes or devices do not
+    match, or the camera has skew."""
     n = means.shape[0]
     shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
     shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}

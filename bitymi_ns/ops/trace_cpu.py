@@ -92,11 +92,8 @@ def _layout(arrays: dict[str, Tensor], width: int, height: int) -> Layout:
 
 
 def count(projection: Projection) -> int:
-    """Count the fragments of a view on the CPU without making their list.
-
-    Raises:
-        RuntimeError: the projection is not on the CPU.
-    """
+    """Count the fragments of a view on the CPU without making their list. Raises RuntimeError: the projection is not on
+    the CPU."""
     geom = projection.geom.detach()
     require("trace_cpu.count", "cpu", geom.device, "count those of `trace`")
     with tracers(geom).borrow() as tracer:

@@ -97,12 +97,8 @@ def select(
 
 
 def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) -> dict[str, Tensor]:
-    """Allocate working memory of the backward kernel, by name.
-
-    Args:
-        geom: [N, 16], detached.
-        texel_alpha: [T] texels with a gradient, summed in int64 with deterministic algorithms; None: none.
-    """
+    """Allocate working memory of the backward kernel, by name. `geom`: [N, 16], detached. `texel_alpha`: [T] texels
+    with a gradient, summed in int64 with deterministic algorithms; None: none."""
     kernels = module(geom.device)
     work = {"dsigma": geom.new_empty(layout.handle.fragments)}
     work["partial"] = geom.new_empty(layout.handle.pairs, kernels.TRACE_SUMS)

@@ -58,11 +58,8 @@ class _ViewColor(torch.autograd.Function):
 
 
 def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
-    """Check the view colours of n surfels; returns the number of terms (sites, coefficients with dc, or lobes).
-
-    Raises:
-        ValueError: unknown kind, or a parameter has the wrong shape.
-    """
+    """Check the view colours of n surfels; returns the number of terms (sites, coefficients with dc, or lobes). Raises
+    ValueError: unknown kind, or a parameter has the wrong shape."""
     entry = entry_of(kind)
     terms = entry.terms(params)
     rows = [(n, *shape) for shape in entry.shapes(terms)]
@@ -74,11 +71,8 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
 
 
 def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
-    """Check the lean view colours of n surfels; synchronises with a CUDA device.
-
-    Raises:
-        ValueError: wrong shape or dtype, a span outside the terms, or harmonics that end within a degree.
-    """
+    """Check the lean view colours of n surfels; synchronises with a CUDA device. Raises ValueError: wrong shape or
+    dtype, a span outside the terms, or harmonics that end within a degree."""
     entry = entry_of(kind)
     base, span, terms = (params[name] for name in LEAN)
     if tuple(base.shape) != (n, 3) or tuple(span.shape) != (n, 2) or span.dtype != torch.int32:

@@ -244,22 +244,14 @@ Kind = Literal[tuple(VIEW_COLORS)]  # type: ignore[valid-type]
 
 
 def entry_of(kind: str) -> ViewColor:
-    """Return the entry of a kind.
-
-    Raises:
-        ValueError: unknown kind.
-    """
+    """Return the entry of a kind. Raises ValueError: unknown kind."""
     if kind not in VIEW_COLORS:
         raise ValueError(f"unknown view colour '{kind}': choose one of {', '.join(VIEW_COLORS)}")
     return VIEW_COLORS[kind]
 
 
 def kind_of(params: Mapping[str, Tensor]) -> str:
-    """Return the kind whose parameters are complete.
-
-    Raises:
-        ValueError: no kind is.
-    """
+    """Return the kind whose parameters are complete. Raises ValueError: no kind is."""
     for kind, entry in VIEW_COLORS.items():
         if all(name in params for name in entry.names):
             return kind

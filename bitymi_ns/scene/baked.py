@@ -91,20 +91,13 @@ class BakedScene:
     cache: DrawCache = field(default_factory=DrawCache, init=False, repr=False, compare=False)
 
     def residuals(self) -> Tensor:
-        """Compute the residual colours of the atlas, [layers, height, width, 3] float32.
-
-        Raises:
-            ValueError: there is no atlas, or only its BC7 blocks.
-        """
+        """Compute the residual colours of the atlas, [layers, height, width, 3] float32. Raises ValueError: there is no
+        atlas, or only its BC7 blocks."""
         return self._values(slice(3)) * self.scale + self.offset
 
     def alphas(self) -> Tensor | None:
         """Compute the atlas's factors m of sigma, [layers, height, width] float32; None if there is no atlas or its
-        texels are opaque.
-
-        Raises:
-            ValueError: there are only the atlas's BC7 blocks.
-        """
+        texels are opaque. Raises ValueError: there are only the atlas's BC7 blocks."""
         if not self.alpha_scale or (self.atlas is None and self.blocks is None):
             return None
         return self._values(3) * self.alpha_scale

@@ -77,11 +77,8 @@ class Camera:
 
     def project(self, points: Tensor, near: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Project world points [M, 3] to pixel coordinates x, y and camera z, each [M], and test if they are inside the
-        image, [M] bool.
-
-        Args:
-            near: near plane; z is clamped to it for x and y, and points nearer than it are not inside.
-        """
+        image, [M] bool. `near`: near plane; z is clamped to it for x and y, and points nearer than it are not
+        inside."""
         x, y, z = self.local(points).unbind(-1)
         depth, K = z.clamp(min=near), self.K.to(points.dtype)
         x, y = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]

@@ -121,14 +121,8 @@ class HashField(ResidualField):
     def voxel_size(self, x: Tensor) -> Tensor:
         """Compute the edges of the finest voxel at world positions.
 
-        Outside the unit ball the contraction stretches a voxel by r^2 radially and by r / (2 - 1/r) tangentially.
-
-        Args:
-            x: [M, 3] world positions.
-
-        Returns:
-            [M, 2] radial and tangential edge, world units.
-        """
+        Outside the unit ball the contraction stretches a voxel by r^2 radially and by r / (2 - 1/r) tangentially. `x`:
+        [M, 3] world positions. Returns [M, 2] radial and tangential edge, world units."""
         g = self.geometry
         finest = g.min_resolution << (self.levels - 1)
         if not g.contract:

@@ -46,14 +46,9 @@ class Sampling:
 
 
 def size_of(photographed: Tensor, camera: Camera) -> float:
-    """Measure the scale of a view relative to the photographs: 1 = same size, 0.5 = half their size.
-
-    Args:
-        photographed: [P, 4] points of the scene with the pixels per unit of length of their photographs.
-
-    Returns:
-        Median over the points inside the image; 1 without such points.
-    """
+    """Measure the scale of a view relative to the photographs: 1 = same size, 0.5 = half their size. `photographed`:
+    [P, 4] points of the scene with the pixels per unit of length of their photographs. Returns median over the points
+    inside the image; 1 without such points."""
     # NumPy: for a few thousand points per frame, torch's overhead would dominate
     viewmat, K, points = (t.detach().cpu().double().numpy() for t in (camera.viewmat, camera.K, photographed))
     x, y, z = (points[:, :3] @ viewmat[:3, :3].T + viewmat[:3, 3]).T

@@ -131,12 +131,8 @@ class Scene(nn.Module):
         return self.surfels["means"].shape[0]
 
     def resize_for_state(self, state: Mapping[str, Tensor], prefix: str = "") -> None:
-        """Resize surfel parameters and texels for a state that is loaded next.
-
-        Args:
-            state: state of a scene of the same configuration.
-            prefix: prefix of the names in `state`.
-        """
+        """Resize surfel parameters and texels for a state that is loaded next. `state`: state of a scene of the same
+        configuration. `prefix`: prefix of the names in `state`."""
         n = len(state[f"{prefix}surfels.means"])
         for parameter in self.surfels.values():
             parameter.data = parameter.new_zeros(n, *parameter.shape[1:])
@@ -220,11 +216,7 @@ class Scene(nn.Module):
         field_mode: Literal["train", "frozen"] = "train",
     ) -> ComparedView | None:
         """Draw a view and compare it with its photograph, see `ops.training_view`; None if views need fragment lists.
-
-        Args:
-            correction: colour correction, [3] or [3, 4], see `train.views.View`.
-            field_mode: as in `render`.
-        """
+        `correction`: colour correction, [3] or [3, 4], see `train.views.View`. `field_mode`: as in `render`."""
         texture = self._unlisted_texture(field_mode)
         if texture is None:
             return None

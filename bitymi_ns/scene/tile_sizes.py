@@ -49,11 +49,8 @@ def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor 
 
 
 def check_sides(r_min: int, r_max: int) -> None:
-    """Check the limits of tile sides.
-
-    Raises:
-        ValueError: a limit is no power of two >= 4, or `r_min` is larger than `r_max`.
-    """
+    """Check the limits of tile sides. Raises ValueError: a limit is no power of two >= 4, or `r_min` is larger than
+    `r_max`."""
     for name, value in (("r_min", r_min), ("r_max", r_max)):
         if value < 4 or value & (value - 1):
             raise ValueError(f"{name} must be a power of two of at least 4 (a BC7 block is 4 x 4 texels), not {value}")
@@ -166,12 +163,8 @@ def max_projected_extent(
 
 
 def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Compute each surfel's largest blending weight at its centre, [N], and its kernel exponent beta, [N].
-
-    Args:
-        surfels: opacity_logits [N], beta_raw [N].
-        transmittance: [N] of `Visibility`; None: no occlusion.
-    """
+    """Compute each surfel's largest blending weight at its centre, [N], and its kernel exponent beta, [N]. `surfels`:
+    opacity_logits [N], beta_raw [N]. `transmittance`: [N] of `Visibility`; None: no occlusion."""
     opacity = surfels["opacity_logits"].sigmoid().clamp(max=ALPHA_MAX)
     if transmittance is not None:
         opacity = opacity * (MARGIN * transmittance).clamp(max=1.0)

@@ -91,12 +91,8 @@ class _Grid(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, x: Tensor, y: Tensor, z: Tensor, count: float) -> _Grid:
-        """Bin the points of a view into nearly square cells.
-
-        Args:
-            x, y, z: [V] pixel coordinates and camera z.
-            count: number of points that decides the size of the cells.
-        """
+        """Bin the points of a view into nearly square cells. `x` and `y` and `z`: [V] pixel coordinates and camera z.
+        `count`: number of points that decides the size of the cells."""
         longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
         side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))
         rows, columns = math.ceil(camera.height / side), math.ceil(camera.width / side)

@@ -26,11 +26,8 @@ class LossWatch:
         self._in_flight: deque[tuple[list[tuple[int, tuple[str, ...]]], Tensor, torch.cuda.Event]] = deque()
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
-        """Check the loss terms of a step; on a CUDA device, a few steps later.
-
-        Raises:
-            TrainingDiverged: a term of this or an earlier step is not finite.
-        """
+        """Check the loss terms of a step; on a CUDA device, a few steps later. Raises TrainingDiverged: a term of this
+        or an earlier step is not finite."""
         names, values = tuple(terms), [term.detach() for term in terms.values()]
         if values[0].device.type != "cuda":
             self._check(scene, [(step, names)], torch.stack(values))

@@ -65,13 +65,8 @@ class Exposure:
         self._learning: list[tuple[int, Tensor]] = []
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
-        """Decide whether to correct photographs, and initialise the corrections.
-
-        Args:
-            points: [M, 3] points of the scene, best those of the capture.
-            views: training photographs at full size.
-            near: near plane, camera z.
-        """
+        """Decide whether to correct photographs, and initialise the corrections. `points`: [M, 3] points of the scene,
+        best those of the capture. `views`: training photographs at full size. `near`: near plane, camera z."""
         self.decided = True
         agreement = estimate_gains(points, views, near)
         prior = self._pooled(exif_gains(self._exif, len(views)), torch.ones(len(views)))
@@ -161,12 +156,8 @@ class Exposure:
 
     @torch.no_grad()
     def step(self, rate: float, processes: Processes = ALONE) -> None:
-        """Update the corrections that `learning` returned by their gradients.
-
-        Args:
-            rate: learning rate of log gains and other entries.
-            processes: processes whose views the step averages over.
-        """
+        """Update the corrections that `learning` returned by their gradients. `rate`: learning rate of log gains and
+        other entries. `processes`: processes whose views the step averages over."""
         learning, self._learning = self._learning, []
         if self.table is None or self._moments is None:
             return
@@ -229,12 +220,8 @@ class Exposure:
         self, state: Mapping[str, Any] | None, count: int, device: torch.device | str | None = None
     ) -> None:
         """Restore what `state_dict` returned. Ignores state saved with another option or number of photographs.
-
-        Args:
-            state: None: saved before corrections existed. Then, and after `off`, `auto` makes none.
-            count: number of training views.
-            device: device for the corrections; None: that of `state`.
-        """
+        `state`: None: saved before corrections existed. Then, and after `off`, `auto` makes none. `count`: number of
+        training views. `device`: device for the corrections; None: that of `state`."""
         if state is None or (self.kind == "auto" and state["kind"] == "off"):  # corrections do not begin midway
             self.decided = self.kind in ("off", "auto")
             return
@@ -265,15 +252,9 @@ def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] 
 def corrected(
     views: Sequence[View], state: Mapping[str, Any] | None, files: Sequence[Path] | None = None
 ) -> Sequence[View]:
-    """Add the final corrections of a run to its training views.
-
-    Args:
-        views: the run's training views at full size.
-        state, files: state and files of its `Exposure`; state None: no corrections.
-
-    Raises:
-        ValueError: the number of photographs differs from the run's.
-    """
+    """Add the final corrections of a run to its training views. `views`: the run's training views at full size. `state`
+    and `files`: state and files of its `Exposure`; state None: no corrections. Raises ValueError: the number of
+    photographs differs from the run's."""
     if state is None or state["table"] is None:
         return views
     exposure = restored(state, len(views), files)
@@ -312,12 +293,8 @@ def _diagonal(table: Tensor) -> slice:
 
 
 def exif_gains(stops: Sequence[float] | None, count: int) -> Tensor:
-    """Compute initial log gains [V, 3] from EXIF exposures, for gamma-encoded colours; 0 if unknown.
-
-    Args:
-        stops: `exif_stops` of each photograph, NaN: unknown; None: unknown for all.
-        count: number of photographs.
-    """
+    """Compute initial log gains [V, 3] from EXIF exposures, for gamma-encoded colours; 0 if unknown. `stops`:
+    `exif_stops` of each photograph, NaN: unknown; None: unknown for all. `count`: number of photographs."""
     if stops is None:
         return torch.zeros(count, 3)
     light = torch.tensor(stops, dtype=torch.float64) * math.log(2.0)

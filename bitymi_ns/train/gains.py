@@ -38,13 +38,9 @@ class ExposureGains(NamedTuple):
 
 @torch.no_grad()
 def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> ExposureGains:
-    """Estimate the photographs' gains from their colours at the points.
-
-    Args:
-        points: [M, 3] world positions.
-        views: V photographs at full size, each read once; masked and transparent pixels are ignored.
-        near: near plane, camera z.
-    """
+    """Estimate the photographs' gains from their colours at the points. `points`: [M, 3] world positions. `views`: V
+    photographs at full size, each read once; masked and transparent pixels are ignored. `near`: near plane, camera
+    z."""
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:HIDING]
     points = points.detach()[order.to(points.device)]
     count = min(len(points), POINTS, max(1, OBSERVATIONS // max(1, len(views))))

@@ -39,24 +39,17 @@ class PointReport:
 
 
 def limit_first_surfels(config: TrainConfig, steps: int, pixels: int, views: int) -> TrainConfig:
-    """Set `first_surfels` by the length of the run, unless the options set it.
-
-    Args:
-        pixels: total over all training views at full size.
-    """
+    """Set `first_surfels` by the length of the run, unless the options set it. `pixels`: total over all training views
+    at full size."""
     if config.first_surfels is not None or not views:
         return config
     return replace(config, first_surfels=max(FEWEST_FIRST, int(steps * pixels / views / PIXELS_PER_FIRST_SURFEL)))
 
 
 def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
-    """Compute 1.1 times the largest distance of the training cameras from their mean, in world units.
-
-    Args:
-        camera_centers: [C, 3].
-        points: [M, 3]. If all cameras are at one position, the extent is the median distance of the finite points
-            from it, and 1 without points.
-    """
+    """Compute 1.1 times the largest distance of the training cameras from their mean, in world units. `camera_centers`:
+    [C, 3]. `points`: [M, 3]. If all cameras are at one position, the extent is the median distance of the finite points
+    from it, and 1 without points."""
     centers = camera_centers.detach().reshape(-1, 3).double().cpu()
     centers = centers[centers.isfinite().all(-1)]
     middle = centers.mean(0) if len(centers) else torch.zeros(3, dtype=torch.float64)
@@ -205,12 +198,8 @@ def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def quat_from_normal(normals: Tensor, angles: Tensor) -> Tensor:
-    """Compute unit quaternions [N, 4] that rotate about z by an angle and then take the z axis to a normal.
-
-    Args:
-        normals: [N, 3] unit vectors.
-        angles: [N] in radians.
-    """
+    """Compute unit quaternions [N, 4] that rotate about z by an angle and then take the z axis to a normal. `normals`:
+    [N, 3] unit vectors. `angles`: [N] in radians."""
     x, y, z = normals.unbind(-1)
     zero = torch.zeros_like(x)
     tilt = torch.stack([1.0 + z, -y, x, zero], -1)  # shortest rotation from (0, 0, 1); vanishes at -z
@@ -227,14 +216,8 @@ def rotate_in_plane(quats: Tensor, angles: Tensor) -> Tensor:
 
 
 def tangents(quats: Tensor) -> Tensor:
-    """Compute the tangents of surfels, the first two columns of their rotation matrices.
-
-    Args:
-        quats: [N, 4], not normalised; zero means no rotation.
-
-    Returns:
-        [N, 3, 2] unit vectors; [..., 0] is the u axis, [..., 1] the v axis.
-    """
+    """Compute the tangents of surfels, the first two columns of their rotation matrices. `quats`: [N, 4], not
+    normalised; zero means no rotation. Returns [N, 3, 2] unit vectors; [..., 0] is the u axis, [..., 1] the v axis."""
     norm = quats.norm(dim=-1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
     w, x, y, z = torch.where(norm > 0, quats / norm.clamp(min=torch.finfo(quats.dtype).tiny), identity).unbind(-1)

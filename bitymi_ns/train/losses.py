@@ -192,12 +192,8 @@ def _mean_of(values: Tensor, known: Tensor, mask: Tensor | None) -> Tensor:
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Compute the PSNR in dB, at most 100 (equal images); NaN if no pixel counts.
-
-    Args:
-        image, target: [H, W, 3] in [0, 1].
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
-    """
+    """Compute the PSNR in dB, at most 100 (equal images); NaN if no pixel counts. `image` and `target`: [H, W, 3] in
+    [0, 1]. `mask`: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere."""
     error = (image - target).square()
     if mask is not None:
         error = error[mask.reshape(error.shape[:2])]
@@ -210,13 +206,9 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
     """Map the colours of each half of an image by an affine fit on the other half, clamped to [0, 1]: [H, W, 3].
 
     Compensates exposure and white balance of held-out photographs: matrix [3, 3] and offset [3] are the least squares
-    fit to `target` over the unmasked pixels of the other half. A half is not mapped if the other half is not finite,
-    or if the share of the other half's pixels that count is below `FITTED`.
-
-    Args:
-        image, target: [H, W, 3] in [0, 1].
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
-    """
+    fit to `target` over the unmasked pixels of the other half. A half is not mapped if the other half is not finite, or
+    if the share of the other half's pixels that count is below `FITTED`. `image` and `target`: [H, W, 3] in [0, 1].
+    `mask`: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere."""
     colors = torch.cat([image, torch.ones_like(image[..., :1])], -1).double()  # [H, W, 4]
     both = torch.cat([colors, target - image], -1)  # [H, W, 7] double
     if mask is not None:

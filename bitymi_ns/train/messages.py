@@ -14,11 +14,8 @@ from bitymi_ns.train.schedules import Schedule
 
 
 def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int = 1) -> list[str]:
-    """Describe the short-run rules in force, and warn if the run ends before it has seen every photograph.
-
-    Args:
-        at_once: views rendered per step.
-    """
+    """Describe the short-run rules in force, and warn if the run ends before it has seen every photograph. `at_once`:
+    views rendered per step."""
     found = []
     if schedule.short_run_gain > 1.0:
         parts = [f"surfels learn {schedule.short_run_gain:.1f} times as fast"]
@@ -39,12 +36,8 @@ def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int =
 
 
 def warnings_at_start(points: PointReport, config: TrainConfig, image_pixels: int, scene: SceneConfig) -> list[str]:
-    """Describe the limits that the initial scene hits.
-
-    Args:
-        points: counts of the sparse points used and dropped.
-        image_pixels: total over all training images.
-    """
+    """Describe the limits that the initial scene hits. `points`: counts of the sparse points used and dropped.
+    `image_pixels`: total over all training images."""
     found = []
     if points.over_cap:
         most, first = config.densify.max_surfels, config.first_surfels
@@ -79,12 +72,8 @@ def recorded(config: TrainConfig) -> str:
 
 
 def other_options(record: str | None, config: TrainConfig) -> list[str]:
-    """List the options of a resumed run that differ from the recorded ones.
-
-    Args:
-        record: result of `recorded`; None: a checkpoint of an earlier version, without a record.
-        config: options of the resumed run.
-    """
+    """List the options of a resumed run that differ from the recorded ones. `record`: result of `recorded`; None: a
+    checkpoint of an earlier version, without a record. `config`: options of the resumed run."""
     if record is None:
         return []
     before, now = (dict(_flat(json.loads(text))) for text in (record, recorded(config)))

@@ -76,11 +76,8 @@ def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> 
 
     Each Adam.step costs 100-200 us of Python, ten times the GPU work. Fused Adam optimisers are therefore stepped
     together: on the CPU by one call per learning rate, bit-identical to each `step`, on CUDA devices by one kernel.
-
-    Args:
-        optimizers: by parameter group.
-        factors: row factors [N] of the updates of parameters [N, ...], by parameter group.
-    """
+    `optimizers`: by parameter group. `factors`: row factors [N] of the updates of parameters [N, ...], by parameter
+    group."""
     fused: list[_AdamParameter] = []
     for name, optimizer in optimizers.items():
         found = _fusable(optimizer, factors.get(name))
@@ -239,11 +236,7 @@ def cap_opacity(
 ) -> int:
     """Clamp opacities to at most `highest`, in place, and reset the optimiser state of those lowered, or of all rows.
 
-    The old momentum would raise the opacities again at once.
-
-    Returns:
-        The number of opacities lowered.
-    """
+    The old momentum would raise the opacities again at once. Returns the number of opacities lowered."""
     logits = surfels["opacity_logits"]
     limit = torch.logit(torch.tensor(highest, dtype=torch.float64)).item()
     above = logits > limit

@@ -49,15 +49,9 @@ def cross_matrix(vector: Tensor) -> Tensor:
 
 
 def moved(viewmat: Tensor, motion: Tensor) -> Tensor:
-    """Apply a rigid motion to a camera pose.
-
-    Args:
-        viewmat: [4, 4] float64, world to camera.
-        motion: [6] float64: rotation vector about the camera centre and translation of it, both in world axes.
-
-    Returns:
-        [4, 4] float64, differentiable in the motion.
-    """
+    """Apply a rigid motion to a camera pose. `viewmat`: [4, 4] float64, world to camera. `motion`: [6] float64:
+    rotation vector about the camera centre and translation of it, both in world axes. Returns [4, 4] float64,
+    differentiable in the motion."""
     rotation = viewmat[:3, :3] @ torch.linalg.matrix_exp(-cross_matrix(motion[:3]))
     center = -viewmat[:3, :3].T @ viewmat[:3, 3] + motion[3:]
     top = torch.cat([rotation, -(rotation @ center)[:, None]], 1)
@@ -160,12 +154,8 @@ class Poses:
 
     @torch.no_grad()
     def step(self, projections: Sequence[Projection], pixels: float, processes: Processes) -> None:
-        """Update the poses of a step's views, after the backward passes.
-
-        Args:
-            projections: one per view, in the order of the calls of `learning`.
-            pixels: see `pose_step`.
-        """
+        """Update the poses of a step's views, after the backward passes. `projections`: one per view, in the order of
+        the calls of `learning`. `pixels`: see `pose_step`."""
         learning, self._learning = self._learning, []
         if self.motions is None or pixels == 0.0:
             return
@@ -189,24 +179,17 @@ class Poses:
         return {"motions": self.motions}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
-        """Restore what `state_dict` returned, also if this run refines poses no further.
-
-        Args:
-            state: None: a checkpoint from before poses were refined. Ignored for another number of photographs.
-        """
+        """Restore what `state_dict` returned, also if this run refines poses no further. `state`: None: a checkpoint
+        from before poses were refined. Ignored for another number of photographs."""
         motions = None if state is None else state["motions"]
         if motions is not None and len(motions) == len(self._cameras):
             self.motions = motions
 
 
 def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
-    """Correct a camera by the weighted mean motion of the nearest photographs, by distance and direction.
-
-    Args:
-        camera: in the frame of the capture.
-        given: [V, 4, 4] float64 poses of the photographs in the capture, world to camera.
-        motions: [V, 6] float64 corrections of these poses, see `moved`.
-    """
+    """Correct a camera by the weighted mean motion of the nearest photographs, by distance and direction. `camera`: in
+    the frame of the capture. `given`: [V, 4, 4] float64 poses of the photographs in the capture, world to camera.
+    `motions`: [V, 6] float64 corrections of these poses, see `moved`."""
     viewmat = camera.viewmat.double().cpu()
     centers = -(given[:, :3, :3] * given[:, :3, 3:]).sum(1)
     reach = (centers - centers.mean(0)).square().sum(1).amax().clamp(min=1e-30)
@@ -219,11 +202,7 @@ def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
 
 def gauge(centers: Tensor, extent: float) -> Tensor:
     """Compute an orthonormal basis [V * 6, D] of the similarities of all cameras: rotations, translations, scale.
-
-    Args:
-        centers: [V, 3] float64 world positions of the cameras.
-        extent: unit of length of translations.
-    """
+    `centers`: [V, 3] float64 world positions of the cameras. `extent`: unit of length of translations."""
     arms = (centers - centers.mean(0)) / extent
     rows = torch.zeros(7, len(centers), 6, dtype=torch.float64)
     for axis in range(3):
@@ -248,12 +227,8 @@ def view_psnr(scene: Scene, view: View, background: Tensor | None) -> float:
 @torch.enable_grad()
 def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: float) -> Camera:
     """Align a camera to a fixed scene: minimise the photometric loss against its photograph from the given pose.
-
-    Args:
-        view: on the scene's device, at full size.
-        background: [3] colour behind the scene; None: black.
-        ssim_weight: SSIM weight of the photometric loss.
-    """
+    `view`: on the scene's device, at full size. `background`: [3] colour behind the scene; None: black. `ssim_weight`:
+    SSIM weight of the photometric loss."""
     target = view.target(background, scene.surfels["means"].device)
 
     def judge(viewmat: Tensor) -> tuple[float, Tensor, Projection]:

@@ -44,11 +44,8 @@ class Preset:
 
 
 def load_preset(name: str, folder: Path | None = None) -> Preset:
-    """Read the preset `name` from `folder` (default: the installed presets).
-
-    Raises:
-        PresetError: the file is missing or is not a valid preset.
-    """
+    """Read the preset `name` from `folder` (default: the installed presets). Raises PresetError: the file is missing or
+    is not a valid preset."""
     folder = preset_dir() if folder is None else folder
     path = folder / f"{name}.yaml"
     values = _read_with_base(path, folder, ())

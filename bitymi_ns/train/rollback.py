@@ -113,11 +113,8 @@ class RollbackGuard:
         return self.config.guard.rollbacks > 0
 
     def before(self, step: int, views: DownscaledViews) -> None:
-        """Capture a state if there is none, and measure the initial loss once; call it before each step.
-
-        Args:
-            views: training views. Losses are compared at full size: images too small for SSIM have smaller losses.
-        """
+        """Capture a state if there is none, and measure the initial loss once; call it before each step. `views`:
+        training views. Losses are compared at full size: images too small for SSIM have smaller losses."""
         if not self.on or self._states:
             return
         self._views = views
@@ -168,13 +165,8 @@ class RollbackGuard:
 
     def failed(self, step: int, error: TrainingDiverged) -> dict[str, float]:
         """Repair the scene after a loss that is not finite (the step is then repeated), or after an update broke it.
-
-        Returns:
-            Counts of what was done, by name.
-
-        Raises:
-            TrainingDiverged: no parameter is broken, rollbacks are disabled or used up, or no state was captured.
-        """
+        Returns counts of what was done, by name. Raises TrainingDiverged: no parameter is broken, rollbacks are
+        disabled or used up, or no state was captured."""
         cause = describe_broken(self.scene)
         if not self.on or not cause:
             raise error

@@ -50,12 +50,8 @@ class Schedule:
         self.plan()
 
     def plan(self, begun: int | None = None) -> None:
-        """Plan the events of the run.
-
-        Args:
-            begun: step at which the texels of a resumed run began, whatever its length was: since then pictures have
-                full size and no surfel may be added; None: it has none.
-        """
+        """Plan the events of the run. `begun`: step at which the texels of a resumed run began, whatever its length
+        was: since then pictures have full size and no surfel may be added; None: it has none."""
         config, densify = self.config, self.config.densify
         # short runs skip events to keep the minimum interval
         reset = densify.reset_interval * self._stride(densify.reset_interval, densify.min_reset_interval)
@@ -156,11 +152,8 @@ class Schedule:
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
 
     def lists_fragments(self, maps: bool) -> bool:
-        """Return True if some steps need fragment lists even on a GPU: for the overdraw, depth or normal loss.
-
-        Args:
-            maps: some views have depth or normals.
-        """
+        """Return True if some steps need fragment lists even on a GPU: for the overdraw, depth or normal loss. `maps`:
+        some views have depth or normals."""
         loss = self.config.loss
         return loss.overdraw_weight > 0.0 or maps and max(loss.depth_weight, loss.normal_weight) > 0.0
 
@@ -231,11 +224,8 @@ class Schedule:
         return [self.scaled(apart * (i + 1)) for i in range(count)]
 
     def lr(self, name: str, step: int) -> float:
-        """Compute the learning rate of a parameter in this step; that of the means in pixels if `in_pixels`.
-
-        Args:
-            name: a surfel parameter, field_table, field_mlp or exposure.
-        """
+        """Compute the learning rate of a parameter in this step; that of the means in pixels if `in_pixels`. `name`: a
+        surfel parameter, field_table, field_mlp or exposure."""
         rates, gain = self.config.lr, self.short_run_gain
         if self._last_part is not None and self.texels_learn(step) and not name.startswith(("field", "exposure")):
             return self._last_part.lr(name, 0) * self._falling(step)

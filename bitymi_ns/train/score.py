@@ -43,13 +43,9 @@ def normalise(values: Tensor) -> Tensor:
 
 
 def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | None = None) -> Tensor:
-    """Find the pixels, [H, W] bool, whose error, normalised over the image, is above `threshold`.
-
-    Args:
-        rgb, target: [H, W, 3]; the error is the mean of |rgb - target| over the channels.
-        threshold: in [0, 1].
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; other pixels are never bad.
-    """
+    """Find the pixels, [H, W] bool, whose error, normalised over the image, is above `threshold`. `rgb` and `target`:
+    [H, W, 3]; the error is the mean of |rgb - target| over the channels. `threshold`: in [0, 1]. `mask`: [H, W] or [H,
+    W, 1] bool, True where the pixel counts; other pixels are never bad."""
     error = (rgb - target).abs().mean(-1)
     if mask is None:
         return normalise(error) > threshold
@@ -75,12 +71,8 @@ def _random_signs(like: Tensor, seed: int) -> Tensor:
 def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, processes: Processes = ALONE) -> Scores:
     """Render the views and score every surfel (the score s_d of the paper and FastGS's prune score).
 
-    Every fragment that is blended at a bad pixel counts one for its surfel, whatever its weight.
-
-    Args:
-        views: at the resolution to compare at; without views all scores are 0.
-        processes: each renders its share of the views.
-    """
+    Every fragment that is blended at a bad pixel counts one for its surfel, whatever its weight. `views`: at the
+    resolution to compare at; without views all scores are 0. `processes`: each renders its share of the views."""
     n = len(scene)
     device = scene.surfels["means"].device
     total = torch.zeros(n, dtype=torch.int64, device=device)

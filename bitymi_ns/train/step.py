@@ -184,10 +184,7 @@ class Training:
 
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
         """Compute `view_losses`. If a loss is not finite, the guard repairs the scene and the view is rendered again.
-
-        Raises:
-            TrainingDiverged: the scene cannot be repaired, or the limit of rollbacks is reached.
-        """
+        Raises TrainingDiverged: the scene cannot be repaired, or the limit of rollbacks is reached."""
         while True:
             self.texels.prepare(self.step, view, self.guard.factor)
             diverged: TrainingDiverged | None = None
@@ -206,14 +203,9 @@ class Training:
             self._set_rates()
 
     def combine(self) -> dict[str, Tensor]:
-        """Average the gradients over all views of the step; call it after the backward passes.
-
-        Returns:
-            Rate factors [N] per surfel, by parameter name, for `optimizers.step`.
-
-        Raises:
-            ProcessesApart, ProcessLost: see `Processes.average_gradients`.
-        """
+        """Average the gradients over all views of the step; call it after the backward passes. Returns rate factors [N]
+        per surfel, by parameter name, for `optimizers.step`. Raises ProcessesApart, ProcessLost: see
+        `Processes.average_gradients`."""
         if self.processes.views > 1:
             groups = (group for optimizer in self.optimizers.values() for group in optimizer.param_groups)
             learned = [parameter for group in groups for parameter in group["params"]]
@@ -223,14 +215,9 @@ class Training:
         return self.step_sizes.factors()
 
     def finish(self) -> dict[str, float]:
-        """Densify, prune, check for divergence and stop the clock; call it after the optimisers.
-
-        Returns:
-            Numbers by action (pruned, rolled_back, ...); empty if none.
-
-        Raises:
-            TrainingDiverged: the limit of rollbacks is reached, or rollbacks are disabled.
-        """
+        """Densify, prune, check for divergence and stop the clock; call it after the optimisers. Returns numbers by
+        action (pruned, rolled_back, ...); empty if none. Raises TrainingDiverged: the limit of rollbacks is reached, or
+        rollbacks are disabled."""
         step, projections, photometric = self.step, self._projections, self._photometric
         assert projections, "a step is finished after its losses"
         self._projections, self._photometric = [], []

@@ -63,11 +63,7 @@ class StepSizes:
         self._set(torch.zeros(0))
 
     def measure(self, scene: Scene, always: bool = True) -> None:
-        """Measure the footprints of the current surfels.
-
-        Args:
-            always: also if the number of surfels has not changed.
-        """
+        """Measure the footprints of the current surfels. `always`: also if the number of surfels has not changed."""
         if self.schedule.in_pixels and (always or len(self.footprints) != len(scene)):
             means = scene.surfels["means"].detach()
             self._set(pixel_footprints(means, self.cameras, scene.near, self.schedule.extent))

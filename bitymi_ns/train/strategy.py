@@ -329,12 +329,8 @@ class Strategy:
 
 
 def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0) -> int:
-    """Compute the number of surfels at which densification stops; 0: no limit.
-
-    Args:
-        image_pixels: total over all training images at full size.
-        first_surfels: initial number of surfels.
-    """
+    """Compute the number of surfels at which densification stops; 0: no limit. `image_pixels`: total over all training
+    images at full size. `first_surfels`: initial number of surfels."""
     densify = config.densify
     if densify.max_surfels > 0 or densify.pixels_per_surfel == 0 or image_pixels == 0:
         return densify.max_surfels

@@ -138,13 +138,9 @@ def blank_texels(
 ) -> TexelField:
     """Create a tile for every surfel, with residuals of 0, and alphas of 1 if alphas are trained.
 
-    A surfel without fragments that may have a residual gets one texel.
-
-    Args:
-        views: sample of the training views at full size; only cameras and masks are used.
-        count: number of all training views.
-        to_come: number of renders in the texel stage.
-    """
+    A surfel without fragments that may have a residual gets one texel. `views`: sample of the training views at full
+    size; only cameras and masks are used. `count`: number of all training views. `to_come`: number of renders in the
+    texel stage."""
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound

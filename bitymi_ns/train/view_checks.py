@@ -13,11 +13,8 @@ _ROUNDING = 1e-3  # by which resampled images may lie outside of 0 to 1
 
 @contextmanager
 def learning_modes() -> Iterator[None]:
-    """Enable gradients, and make new tensors float32, in the block; also a decorator.
-
-    Raises:
-        ValueError: torch is in inference mode, whose tensors cannot learn.
-    """
+    """Enable gradients, and make new tensors float32, in the block; also a decorator. Raises ValueError: torch is in
+    inference mode, whose tensors cannot learn."""
     if torch.is_inference_mode_enabled():
         raise ValueError("nothing can learn in torch.inference_mode(): call this outside of it")
     before = torch.get_default_dtype()
@@ -30,12 +27,8 @@ def learning_modes() -> Iterator[None]:
 
 
 def checked_views(views: Sequence[View], name: str = "views") -> list[View]:
-    """Check views, and convert their masks to bool.
-
-    Raises:
-        ValueError: a camera, image, mask, correction or map has another shape, type or range than `View` states; the
-            message has its name and index.
-    """
+    """Check views, and convert their masks to bool. Raises ValueError: a camera, image, mask, correction or map has
+    another shape, type or range than `View` states; the message has its name and index."""
     return [_checked(view, f"{name}[{i}]") for i, view in enumerate(views)]
 
 

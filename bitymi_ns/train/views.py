@@ -133,12 +133,8 @@ def as_float(image: Tensor) -> Tensor:
 
 
 def downscale_image(image: Tensor, width: int, height: int) -> Tensor:
-    """Downscale an image by area averaging to [height, width, C].
-
-    Args:
-        image: [H, W, C]; with C = 4 colours are weighted by alpha, so that hidden colours do not bleed in.
-        width, height: new size in pixels.
-    """
+    """Downscale an image by area averaging to [height, width, C]. `image`: [H, W, C]; with C = 4 colours are weighted
+    by alpha, so that hidden colours do not bleed in. `width` and `height`: new size in pixels."""
     if image.shape[:2] == (height, width):
         return image
     alpha = image[..., 3:]
@@ -199,11 +195,8 @@ def over_background(image: Tensor, background: Tensor | None) -> Tensor:
 def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
     """Move a view to a device and downscale its image to the size of `camera`, the view's camera scaled.
 
-    The image may have that size already.
-
-    Raises:
-        ValueError: image, mask, depth or normals have the size of neither camera.
-    """
+    The image may have that size already. Raises ValueError: image, mask, depth or normals have the size of neither
+    camera."""
     image = as_float(view.image.to(device))
     for what in ("image", "mask", "depth", "normal"):
         picture = getattr(view, what)

@@ -85,12 +85,8 @@ class Site:
         return object() if path == _NOTES else None if self.bundle is None else self.bundle.stamp()
 
     def read(self, path: str) -> bytes | bytearray:
-        """Read one of `paths`.
-
-        Raises:
-            BundleError: a file of the bundle is missing, altered, or a link out of the bundle.
-            OSError: a file of the page cannot be read.
-        """
+        """Read one of `paths`. Raises BundleError: a file of the bundle is missing, altered, or a link out of the
+        bundle. Raises OSError: a file of the page cannot be read."""
         if path == _NOTES:
             notes = self.notes()
             if notes is None:
@@ -107,11 +103,7 @@ def media_type(path: str) -> str:
 
 
 def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
-    """Return readers of the built page's files, by name.
-
-    Raises:
-        PageError: the page was not built.
-    """
+    """Return readers of the built page's files, by name. Raises PageError: the page was not built."""
     folder = Path(str(resources.files("bitymi_ns.view"))) / "page"
     files = {path.name: path.read_bytes for path in sorted(folder.glob("*")) if path.is_file()}
     if "index.html" not in files:
@@ -120,12 +112,9 @@ def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
 
 
 def site_of(bundle: Path) -> Site:
-    """Build a site of the page and a bundle; parts of a single-file bundle are served as separate files.
-
-    Raises:
-        PageError: the page was not built.
-        BundleError: there is no bundle, or its bundle.json or notes.json is damaged.
-    """
+    """Build a site of the page and a bundle; parts of a single-file bundle are served as separate files. Raises
+    PageError: the page was not built. Raises BundleError: there is no bundle, or its bundle.json or notes.json is
+    damaged."""
     notes_of(bundle)
     shown = Shown(Path(os.path.realpath(bundle)))
     files = {**page_files(), "view.json": partial(_view_json, bundle)}
@@ -134,12 +123,8 @@ def site_of(bundle: Path) -> Site:
 
 def single_site(bundle: Path) -> Site:
     """Build a site of the page and a single-file bundle, which the page reads by range requests, or as a whole if the
-    server does not support them.
-
-    Raises:
-        PageError: the page was not built.
-        BundleError: there is no bundle, or it is damaged.
-    """
+    server does not support them. Raises PageError: the page was not built. Raises BundleError: there is no bundle, or
+    it is damaged."""
     info, files = read_manifest(bundle), page_files()
     empty, named = (_BUNDLE_TAG.format(name).encode() for name in ("", SINGLE))
     index = files["index.html"]()
@@ -197,11 +182,7 @@ class Shown:
         return found.st_ino, found.st_size, found.st_mtime_ns
 
     def read(self, name: str) -> bytes | bytearray:
-        """Read a file to serve.
-
-        Raises:
-            BundleError: it is missing, altered, or a link out of the bundle.
-        """
+        """Read a file to serve. Raises BundleError: it is missing, altered, or a link out of the bundle."""
         self._refresh()
         if name == MANIFEST:
             return self._manifest

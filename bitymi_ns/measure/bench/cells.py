@@ -77,11 +77,7 @@ class Cells:
         return self._known.get(identity(key))
 
     def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:
-        """Append a cell, after removing a truncated last line.
-
-        Raises:
-            BenchError: the file cannot be written.
-        """
+        """Append a cell, after removing a truncated last line. Raises BenchError: the file cannot be written."""
         cell = {"key": key, "value": value, "made": origin}
         line = json.dumps(cell, allow_nan=False).encode("utf8") + b"\n"
         with write_errors_as(self.path, BenchError, ", with --work"):

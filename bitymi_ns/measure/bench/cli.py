@@ -64,11 +64,7 @@ class BenchRun:
         return standard_scenes(self.suite, self.data[0], self.scenes)
 
     def matrix(self) -> Matrix:
-        """Build the matrix of these options.
-
-        Raises:
-            BenchError: an option is invalid; the message says which.
-        """
+        """Build the matrix of these options. Raises BenchError: an option is invalid; the message says which."""
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
         if self.pictures < 0:

@@ -76,10 +76,7 @@ def read_result(work: Path, stage: CellSpec) -> dict[str, Any]:
     train: `steps`, `seconds` and `cpu_seconds` of the training steps only (no loading, evaluation or saving),
     `surfels`, `fragments`, `curve`. export: `bytes`, `files`, `format` and `statistics` of the bundle. eval:
     nerfstudio's `results`, means over the held-out views. pictures: the number of `views`. All but eval: the `folder`.
-
-    Raises:
-        CommandFailed: there are no readable figures.
-    """
+    Raises CommandFailed: there are no readable figures."""
     readers = {"train": _train, "export": _export, "eval": _evaluation, "pictures": _pictures}
     try:
         figures = readers[stage.kind](output_of(work, stage), stage)
@@ -140,11 +137,7 @@ def missing(chain: Chain, cells: Cells) -> list[CellSpec]:
 
 @contextmanager
 def locked(work: Path, run: Run) -> Iterator[Lock]:
-    """Lock a run against other processes.
-
-    Raises:
-        CommandFailed: another process holds the lock.
-    """
+    """Lock a run against other processes. Raises CommandFailed: another process holds the lock."""
     path = work / "locks" / f"{run.folder.replace('/', '--')}.lock"
     with write_errors_as(work, BenchError, ", with --work"):
         path.parent.mkdir(parents=True, exist_ok=True)

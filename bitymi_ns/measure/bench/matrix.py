@@ -185,11 +185,7 @@ def suites() -> dict[str, Suite]:
 
 def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
     """List captures in any format that `ns-train bitymi --data` accepts. A Blender data set uses the points of its
-    `hull_pc.ply`, if any.
-
-    Raises:
-        BenchError: a folder is not a capture, two have the same name, or there is none.
-    """
+    `hull_pc.ply`, if any. Raises BenchError: a folder is not a capture, two have the same name, or there is none."""
     if not folders:
         raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')
     scenes = []
@@ -211,11 +207,8 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
 
 
 def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[SceneSpec]:
-    """List the scenes of a standard data set.
-
-    Raises:
-        BenchError: a scene does not exist, or its folder lacks required files.
-    """
+    """List the scenes of a standard data set. Raises BenchError: a scene does not exist, or its folder lacks required
+    files."""
     suite, scenes = suites()[name], []
     unknown = sorted(set(only) - set(suite.scenes))
     if unknown:
@@ -250,14 +243,8 @@ class _Plan(BaseModel):
 
 
 def read_plan(name: str) -> tuple[list[MethodSpec], list[BundleSpec] | None]:
-    """Read a plan by name, or from a YAML file.
-
-    Returns:
-        Rows, and bundles or None if the plan states none.
-
-    Raises:
-        BenchError: the plan does not exist or is malformed; the message says where.
-    """
+    """Read a plan by name, or from a YAML file. Returns rows, and bundles or None if the plan states none. Raises
+    BenchError: the plan does not exist or is malformed; the message says where."""
     if name.endswith((".yaml", ".yml")):
         entry = _read(Path(os.path.expanduser(name)))
     else:

@@ -89,11 +89,7 @@ def run_measured(
 
 
 def tool(name: str) -> str:
-    """Find a console script in this Python's environment or on PATH.
-
-    Raises:
-        BenchError: it is missing.
-    """
+    """Find a console script in this Python's environment or on PATH. Raises BenchError: it is missing."""
     beside = Path(sys.executable).with_name(name)
     found = str(beside) if beside.is_file() else shutil.which(name)
     if found is None:

@@ -55,11 +55,7 @@ class _Render:
 
 
 def open_image(path: Path) -> Image.Image:
-    """Read an image as RGB, or as RGBA if it has transparency.
-
-    Raises:
-        OSError: the file is not a readable image.
-    """
+    """Read an image as RGB, or as RGBA if it has transparency. Raises OSError: the file is not a readable image."""
     open_regular(path).close()
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as opened:

@@ -80,12 +80,8 @@ def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
 
 
 def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, float]]:
-    """Compute the Pareto front of (cost, quality) points, cheapest first, without duplicates.
-
-    Args:
-        points: costs (lower is better) and qualities.
-        up: higher quality is better (PSNR), else lower (FLIP).
-    """
+    """Compute the Pareto front of (cost, quality) points, cheapest first, without duplicates. `points`: costs (lower is
+    better) and qualities. `up`: higher quality is better (PSNR), else lower (FLIP)."""
     best: list[tuple[float, float]] = []
     for cost, quality in sorted(set(points), key=lambda p: (p[0], -p[1] if up else p[1])):
         if not best or (quality > best[-1][1] if up else quality < best[-1][1]):

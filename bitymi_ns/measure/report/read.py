@@ -41,11 +41,8 @@ _POSES = {"source", "registered", "given", "reprojection_error", "track_length",
 
 
 def parse_json(text: str, where: str) -> Any:
-    """Parse JSON (NaN and Infinity tokens allowed).
-
-    Raises:
-        ReportError: it is not valid JSON; the message names the file.
-    """
+    """Parse JSON (NaN and Infinity tokens allowed). Raises ReportError: it is not valid JSON; the message names the
+    file."""
     try:
         return json_of(text)
     except ValueError as error:
@@ -53,11 +50,7 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def read_text(path: Path) -> str:
-    """Read a text file.
-
-    Raises:
-        ReportError: it is too large, not text, or cannot be read.
-    """
+    """Read a text file. Raises ReportError: it is too large, not text, or cannot be read."""
     with reading(path, _refuse, "Write it again, or leave it out."):
         return text_of(path, MAX_BYTES)
 
@@ -69,11 +62,7 @@ def _refuse(message: str, cause: BaseException) -> NoReturn:
 def read_lines(path: Path) -> tuple[list[Any], list[str]]:
     """Read the values of a JSONL file; also returns notes.
 
-    A truncated last line (of a killed run) is skipped with a note.
-
-    Raises:
-        ReportError: another line is broken.
-    """
+    A truncated last line (of a killed run) is skipped with a note. Raises ReportError: another line is broken."""
     numbered = [(i, s) for i, s in enumerate(read_text(path).splitlines(), 1) if s.strip()]
     values, notes = [], []
     for position, (number, line) in enumerate(numbered):
@@ -103,11 +92,8 @@ def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
 
 
 def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]]:
-    """Read the worst views listed in a pictures.json, as in `Records`; empty if the file is something else.
-
-    Raises:
-        ReportError: it is not valid JSON, or its views are malformed.
-    """
+    """Read the worst views listed in a pictures.json, as in `Records`; empty if the file is something else. Raises
+    ReportError: it is not valid JSON, or its views are malformed."""
     data = parse_json(read_text(path), str(path))
     if not isinstance(data, dict) or "bitymi_pictures" not in data:
         return {}
@@ -130,14 +116,8 @@ def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]
 
 
 def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
-    """Add the cells of a benchmark, and the curves and images that they name, if these exist.
-
-    Args:
-        cells: of the file `path`.
-
-    Raises:
-        ReportError: a cell lacks an entry that its kind requires.
-    """
+    """Add the cells of a benchmark, and the curves and images that they name, if these exist. `cells`: of the file
+    `path`. Raises ReportError: a cell lacks an entry that its kind requires."""
     keys: dict[str, dict[str, Any]] = {}  # identity of a run -> a cell's key
     runs: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}  # identity of a run -> (kind, bundle) -> value
     for cell in cells:

@@ -37,12 +37,8 @@ class Arrays:
 
 
 def arrays(scene: BakedSceneLike) -> Arrays:
-    """Convert a scene.
-
-    Raises:
-        TypeError: the surfels are not float32.
-        ValueError: a view-colour parameter has a wrong shape, or a tile lies outside its page.
-    """
+    """Convert a scene. Raises TypeError: the surfels are not float32. Raises ValueError: a view-colour parameter has a
+    wrong shape, or a tile lies outside its page."""
     p = {name: value.detach().cpu() for name, value in scene.surfels.items()}
     for name, value in p.items():
         if value.dtype != torch.float32 and name != "view_span":

@@ -20,11 +20,7 @@ class WebGpuUnavailable(RuntimeError):
 
 @functools.cache
 def library() -> ModuleType:
-    """Import wgpu.
-
-    Raises:
-        WebGpuUnavailable: not installed, or not loadable.
-    """
+    """Import wgpu. Raises WebGpuUnavailable: not installed, or not loadable."""
     try:
         return importlib.import_module("wgpu")
     except Exception as error:  # the library may be for another system; what it raises is undocumented
@@ -36,10 +32,7 @@ def library() -> ModuleType:
 @functools.cache
 def device() -> Any:
     """Return the device of this process, a GPU if possible, else a software adapter, with the available `OPTIONAL`.
-
-    Raises:
-        WebGpuUnavailable: none found; says what to do.
-    """
+    Raises WebGpuUnavailable: none found; says what to do."""
     rank = {"DiscreteGPU": 0, "IntegratedGPU": 1, "VirtualGPU": 2, "Unknown": 3, "CPU": 4}
     found = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
     if not found:

@@ -334,11 +334,8 @@ def draw(
     photo_pixel: float = 1.0,
     layers: int = LAYERS,
 ) -> dict[str, Tensor]:
-    """Draw views one by one to the CPU; see `baked.draw`.
-
-    Raises:
-        WebGpuUnavailable: the package wgpu or a graphics device is missing.
-    """
+    """Draw views one by one to the CPU; see `baked.draw`. Raises WebGpuUnavailable: the package wgpu or a graphics
+    device is missing."""
     check_images(images, on_cuda=False)
     common_size(cameras)
     texels = (scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual, scene.mean_alpha)

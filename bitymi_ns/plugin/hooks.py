@@ -106,7 +106,7 @@ def _with_members(union: Any, more: Sequence[Any]) -> Any:
 
 
 def find_config() -> None:
-    """Take a folder's config.yml, and stop before nerfstudio loads what is none as YAML, or one of classes that are gone.
+    """Take a folder's config.yml, and stop before nerfstudio loads what is no YAML, or of classes that are gone.
 
     Changes: --load-config in `sys.argv`, when the plugin is loaded. For: commands with that option but MESH_COMMAND,
     which reads bundles without config.yml. Without: tracebacks of folders, missing files, binary data and modules.
@@ -123,7 +123,7 @@ def find_config() -> None:
     if not config.is_file():
         fail(f"there is no {config}: give the {CONFIG} of a run (ns-train says where it is) or of a bundle.")
     if b"bitymi_ns.host." in config.read_bytes():
-        fail(f"{config} is of an early version, whose modules bitymi_ns.host are gone: train or export the scene again.")
+        fail(f"{config} is of an early version, whose modules bitymi_ns.host are gone: train or export again.")
     if config != path:
         sys.argv[i] = f"--load-config={config}" if "=" in sys.argv[i] else str(config)
 

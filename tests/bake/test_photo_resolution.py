@@ -16,24 +16,24 @@ def test_rates_are_geometric_means_over_the_views() -> None:
     surfels = {"means": torch.zeros(1, 3)}
     cameras = [make_camera(distance) for distance in (4.0, 8.0, 4.0)]
     focal = math.sqrt(float(cameras[0].K[0, 0] * cameras[0].K[1, 1]))
-    row = photo_resolution(BakeInput(surfels, cameras, 0.2, 0.02, False))
+    row = photo_resolution(BakeInput(surfels, cameras, 0.2, 0.02))
     assert row.tolist() == [[0.0, 0.0, 0.0, pytest.approx(focal / (4 * 8 * 4) ** (1 / 3))]]
     seen = torch.tensor([[False], [True], [False]])
     visible = Visibility(torch.ones(1), torch.ones(1), seen)
-    row = photo_resolution(BakeInput(surfels, cameras, 0.2, 0.02, False, visible))
+    row = photo_resolution(BakeInput(surfels, cameras, 0.2, 0.02, visible))
     assert row[0, 3] == pytest.approx(focal / 8)
 
 
 def test_nothing_is_known_without_views() -> None:
     surfels = {"means": torch.tensor([[0.0, 0.0, 1000.0], [0.0, 0.0, -1000.0]])}
-    assert photo_resolution(BakeInput(surfels, [], 0.2, 0.02, False)) is None
+    assert photo_resolution(BakeInput(surfels, [], 0.2, 0.02)) is None
     sideways = {"means": torch.tensor([[1e5, 0.0, 0.0]])}
-    assert photo_resolution(BakeInput(sideways, [make_camera()], 0.2, 0.02, False)) is None
+    assert photo_resolution(BakeInput(sideways, [make_camera()], 0.2, 0.02)) is None
 
 
 def test_points_are_drawn_evenly() -> None:
     surfels = make_surfels(2000)
-    points = photo_resolution(BakeInput(surfels, [make_camera(20.0)], 0.2, 0.02, False))
+    points = photo_resolution(BakeInput(surfels, [make_camera(20.0)], 0.2, 0.02))
     assert points.shape == (POINTS, 4) and points.dtype == torch.float32 and bool((points[:, 3] > 0).all())
 
 

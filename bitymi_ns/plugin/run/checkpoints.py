@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -98,9 +99,9 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     return state
 
 
-def check_removed(source: Path | str, scene: Mapping[str, Any], rates: Mapping[str, Any] | None = None) -> None:
+def check_removed(source: Path | str, scene: Mapping[str, Any], rates: Mapping[str, Any]) -> None:
     """Fail on recorded options that only earlier versions can follow: those of the scene, and the learning rates."""
-    for option, value in (("scene.prefilter", scene.get("prefilter")), ("train.lr.means", (rates or {}).get("means"))):
+    for option, value in (("scene.prefilter", scene.get("prefilter")), ("train.lr.means", rates.get("means"))):
         if value not in (None, "low_pass"):
             fail(f"{source} asks for {option} {value}, which is gone: train the scene again")
 
@@ -115,11 +116,13 @@ def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
         fail(f"{path} is from a newer bitymi-ns; update it to load this checkpoint")
     try:
         there, here = dict(json_of(extra["scene"])), dataclasses.asdict(scene)
-        rates = dict(json_of(extra.get("train", "{}"))).get("lr")
     except (ValueError, TypeError, KeyError) as error:
         fail(f"the checkpoint {path} was altered: it does not say what its scene is made of. Train again.", error)
+    rates: Mapping[str, Any] = {}
+    with suppress(ValueError, TypeError, LookupError):  # `check` names what is wrong
+        rates = dict(json_of(extra["train"])["lr"])
     check_removed(path, there, rates)
-    check_removed(path.parent.parent / "config.yml", vars(scene))
+    check_removed(path.parent.parent / "config.yml", vars(scene), {})
     different = [k for k in there if k in here and k not in MAY_DIFFER and there[k] != here[k]]
     if different:
         lines = "\n".join(

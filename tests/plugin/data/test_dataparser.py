@@ -277,20 +277,6 @@ def test_instant_ngps_transforms(ngp: Path, capsys: pytest.CaptureFixture[str]) 
         same(places[path.name], pose[:, 3])
 
 
-def test_photographs_of_any_ending(ngp: Path) -> None:
-    for path in images_of(ngp):
-        Image.open(path).save(path.with_suffix(".jpg"))
-        path.unlink()
-    assert load_any(ngp).train_dataset.image_filenames[0].name == "frame_00002.jpg"
-    Image.new("RGB", (48, 36)).save(ngp / "images/frame_00003.webp")
-    with expect("frame 9 is of ./images/frame_00003, but there are images/frame_00003.jpg, images/frame_00003.webp"):
-        load_any(ngp)
-    for path in (ngp / "images").glob("frame_00003.*"):
-        path.unlink()
-    with expect(r"(?s)1 of 12 photographs of .*transforms.json are missing:\s+\S*images/frame_00003\s+Copy them there"):
-        load_any(ngp)
-
-
 def test_focal_lengths_of_instant_ngp(ngp: Path) -> None:
     edit(ngp, lambda meta: meta.update(fl_x=40.0, fl_y=50.0))
     cameras = load_any(ngp).train_dataset.cameras
@@ -298,9 +284,6 @@ def test_focal_lengths_of_instant_ngp(ngp: Path) -> None:
     edit(ngp, lambda meta: (meta.pop("fl_x"), meta.pop("fl_y"), meta.update(camera_angle_y=0.9)))
     fy = float(load_any(ngp).train_dataset.cameras.fy[0])
     assert fy == pytest.approx(18 / math.tan(0.45))
-    edit(ngp, lambda meta: meta.update(equirectangular=True))
-    with expect('equirectangular is set, .*rows show equal areas.* write "camera_model": "EQUIRECTANGULAR"'):
-        load_any(ngp)
 
 
 # on the command line, and in config.yml

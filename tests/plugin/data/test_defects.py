@@ -1,8 +1,11 @@
-"""A defect of a capture ends in one line that names it: a table of formats and defects."""
+"""A defect of a capture ends in one line that names it: a table of formats and defects; and a table of what makes no
+difference."""
 
 import json
 import math
+import re
 import shutil
+import unicodedata
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -10,10 +13,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-from tests.captures import as_binary, edit, expect, load_any
-from tests.formats import colmap, instant_ngp, nerfstudio, polycam, record3d, scanner_app, scannet, stray_scanner
+from tests.captures import as_binary, edit, edit_frames, expect, images_of, load_any, printed
+from tests.formats import (
+    JSON,
+    PHOTOGRAPHS,
+    blender,
+    colmap,
+    instant_ngp,
+    nerfstudio,
+    polycam,
+    record3d,
+    scanner_app,
+    scannet,
+    stray_scanner,
+)  # fmt: skip
 
 HUGE = 10**400
 Change = Callable[[Path], Any]
@@ -39,7 +55,8 @@ def pose(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     """Change the 3 x 3 part of the fourth pose."""
 
     def apply(meta: dict[str, Any]) -> None:
-        for row, new in zip(meta["frames"][3]["transform_matrix"], change(np.eye(3)).tolist(), strict=False):
+        matrix = meta["frames"][3]["transform_matrix"]
+        for row, new in zip(matrix, change(np.array(matrix)[:3, :3]).tolist(), strict=False):
             row[:3] = new
 
     return entry(apply)
@@ -87,6 +104,87 @@ def without(name: str) -> Change:
     return lambda folder: shutil.rmtree(folder / name) if (folder / name).is_dir() else (folder / name).unlink()
 
 
+def encoded(encoding: str, start: str = "") -> Change:
+    """Write a file in another encoding."""
+    return lambda path: path.write_text(start + path.read_text("utf8"), encoding)
+
+
+def matrices(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Change all poses."""
+
+    def apply(one: dict[str, Any]) -> None:
+        one["transform_matrix"] = change(np.array(one["transform_matrix"])).tolist()
+
+    return lambda path: edit_frames(path, apply)
+
+
+def scaled(factor: float) -> Change:
+    return matrices(lambda pose: pose * [[factor] * 3 + [1.0]])
+
+
+def names(change: Callable[[str], str]) -> Change:
+    """Rename photographs, with a letter that is not ASCII, and change their names in the capture's file or model."""
+
+    def apply(place: Path) -> None:
+        file, folder = (place / "images.txt", place.parents[1]) if place.is_dir() else (place, place.parent)
+        for path in images_of(folder):
+            path.rename(path.with_name(path.name.replace("frame_", "f\u00fcr_")))
+        quoted: Callable[[str], str] = str if place.is_dir() else lambda name: json.dumps(name)[1:-1]
+        old = r"((?:images/)?)frame_(\d+.png)"
+        new = re.sub(old, lambda found: quoted(change(f"{found[1]}f\u00fcr_{found[2]}")), file.read_text())
+        file.write_text(new, "utf8")
+
+    return apply
+
+
+def two_endings(path: Path) -> None:
+    for file in images_of(path.parent):
+        file.rename(file.with_name(f"{file.stem}.jpg.png"))
+    edit_frames(path, lambda one: one.update(file_path=f"./{one['file_path'].replace('.png', '.jpg')}"))
+
+
+def two_files(path: Path) -> None:
+    (path.parent / "images/frame_00003.webp").write_bytes((path.parent / "images/frame_00003.png").read_bytes())
+    edit(path, lambda meta: meta["frames"][2].update(file_path="images/frame_00003"))
+
+
+def nulls(path: Path) -> None:
+    absent = ("applied_transform", "applied_scale", "orientation_override", "distortion_params")
+    edit(path, lambda meta: (meta.update(dict.fromkeys(absent)), meta["frames"][0].update(mask_path=None)))
+    edit_frames(path, lambda one: one.update(mask_path=one.get("mask_path", ""), depth_file_path=None))
+
+
+def camera_matrices(path: Path) -> None:
+    """NeuS2's matrices, or a focal length alone; what is left out is the picture's, or of square pixels."""
+
+    def change(meta: dict[str, Any]) -> None:
+        fx, cy, *_ = (meta.pop(key) for key in ("fl_x", "cy", "fl_y", "cx", "w", "h"))
+        for i, one in enumerate(meta["frames"]):
+            one.update({"intrinsic_matrix": [[fx, 0, 24], [0, fx, cy], [0, 0, 1]]} if i % 2 else {"fl_y": fx})
+
+    edit(path, change)
+
+
+def cloud(name: str) -> Change:
+    """Move the point cloud to `points/cloud.ply`, and name it so."""
+
+    def apply(path: Path) -> None:
+        (path.parent / "points").mkdir()
+        (path.parent / "sparse_pc.ply").rename(path.parent / "points/cloud.ply")
+        edit(path, lambda meta: meta.update(ply_file_path=name))
+
+    return apply
+
+
+def angle(value: Any) -> Change:
+    """State the focal length by an angle alone."""
+    return entry(lambda meta: ([meta.pop(key) for key in ("fl_x", "fl_y")], meta.update(camera_angle_x=value)))
+
+
+def no_val_frames(path: Path) -> None:
+    (path.parent / "transforms_val.json").write_text(json.dumps({**json.loads(path.read_text()), "frames": []}))
+
+
 def box_of_ngp(path: Path, value: Any) -> None:
     edit(path, lambda meta: (meta.pop("applied_transform", None), meta.update(aabb_scale=value)))
 
@@ -131,6 +229,7 @@ TRANSFORMS: list[tuple[Change, str]] = [
     (entry(lambda meta: meta["frames"].insert(1, {"file_path": "a.png"})),
      "frame 1 .* has no transform_matrix. Add that"),
     (entry(lambda meta: meta["frames"].__setitem__(1, None)), "frame 1 .* has no file_path and no transform_matrix"),
+    (matrices(np.transpose), "last row of the .* of .*_00001.png is .* not 0 0 0 1.*has to be transposed"),
     (frame(3, transform_matrix="here"), "frame_00004.png is not a matrix of 4 x 4"),
     (frame(3, transform_matrix=[[HUGE] * 4] * 4), "transform_matrix of images/frame_00004.png is not a matrix"),
     (frame(3, transform_matrix=[[1e200, 0, 0, 0], [0, 1e-200, 0, 0], [0, 0, 1e200, 0]]),
@@ -142,6 +241,7 @@ TRANSFORMS: list[tuple[Change, str]] = [
                           (lambda part: part * [1, 1, 1.1], "is sheared or stretched"),
                           (lambda part: 0 * part, "is zero"))),
     (entries(ply_file_path="gone.ply"), "cloud .*gone.ply cannot be read: it does not exist.*remove ply_file_path"),
+    (cloud("C:\\room\\CLOUD.PLY"), "the point cloud .* cannot be read: it does not exist"),
     (entries(ply_file_path=7), "ply_file_path is 7, not the name of a file"),
     (entries(ply_file_path="a" * 300), "the point cloud .*/aaa.* cannot be read: File name too long"),
     (frame(2, file_path=7), "the file_path of frame 2 is 7, not the name of a file"),
@@ -185,6 +285,7 @@ MODEL: list[tuple[str, Change, str]] = [
       for name in ("cameras.bin", "images.bin", "points3D.bin")
       for change in (lambda data: data[:-5], lambda data: data + b"more")),
 ]  # fmt: skip
+CAMERA_ENTRIES = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height")
 CAMERA = "keyframes/corrected_cameras/3.json"
 LARGE = "3.json cannot be read: a number in it is too large"
 SCAN: list[tuple[Any, str, Change, str]] = [
@@ -218,8 +319,21 @@ SCAN: list[tuple[Any, str, Change, str]] = [
 ]  # fmt: skip
 DEFECTS: list[tuple[Callable[[Path], Path], str, Change, str]] = [
     *((nerfstudio, "", change, message) for change, message in TRANSFORMS),
+    (nerfstudio, "", content('{"frames": ' + "[" * 500 + "]" * 500 + "}"), "cannot be read: it is nested too deeply"),
+    (blender, "", angle(39.6), r"train.json: camera_angle_x is 39.6.*not degrees \(39.6 deg.* 0.69115\)"),
+    (blender, "", angle(True), "camera_angle_x for all frames is True, which is no number"),
+    (blender, "", angle(3.14159), "focal length of .*_00002.png.*span 180 degrees.*camera_angle_x is in radia"),
+    (blender, "", entries(frames=None), "transforms_train.json lists no frames"),
+    (blender, "", entries(frames=[]), "transforms_train.json lists no frames"),
+    (blender, "", no_val_frames, "transforms_val.json lists no frames.*move a few frames there"),
+    (blender, "", pose(lambda part: part + 0.3 * part[:, [1, 0, 2]] * [1, 0, 0]),
+     "transforms_train.json: the 3 x 3 part of the pose of images/frame_00004.png is no rotation"),
     (nerfstudio, "", lambda path: path.write_text(f"// by hand\n{path.read_text()}"), NOT_JSON),
     (nerfstudio, "", lambda path: path.write_text(f"{path.read_text().rstrip()[:-1]},}}"), NOT_JSON),
+    (instant_ngp, "", entries(equirectangular=True),
+     'equirectangular is set, .*rows show equal areas.* write "camera_model": "EQUIRECTANGULAR"'),
+    (instant_ngp, "", two_files, "frame 2 is of images/frame_00003, but there are .*3.png, images/.*webp"),
+    (instant_ngp, "", frame(2, file_path="images/frame_3"), r"(?s)1 of 12 .* missing:\s+\S*images/frame_3\s+Copy"),
     *((instant_ngp, "", partial(box_of_ngp, value=value), "transforms.json: aabb_scale")
       for value in (0, -1, float("inf"), HUGE, "wide", [])),
     *((colmap, file, change, message) for file, change, message in MODEL),
@@ -236,3 +350,62 @@ def test_a_defect_is_named(
     options = {"format": {nerfstudio: "nerfstudio", instant_ngp: "instant-ngp"}.get(form, "auto")}
     with expect(message):
         load_any(capture if place.is_relative_to(capture) else place, **options)
+
+
+NAMES = {
+    "case": lambda name: name.upper(),
+    "ending": lambda name: name.replace(".png", ".JPG"),
+    "no ending": lambda name: name.replace(".png", ""),
+    "backslashes": lambda name: ".\\" + name.replace("/", "\\"),
+    "absolute": lambda name: f"/home/somebody/project/{name}",
+    "drive": lambda name: "C:\\Users\\somebody\\" + name.replace("/", "\\"),
+    "unicode": lambda name: unicodedata.normalize("NFD", name),
+}
+OTHER_NAMES = "12 of 12 photographs have other names than it says"
+SAME: list[tuple[Callable[[Path], Path], str, Change, str]] = [
+    *((form, "", names(change), "" if what in ("backslashes", "no ending") else OTHER_NAMES)
+      for form in PHOTOGRAPHS for what, change in NAMES.items()),
+    *((form, "", encoded(encoding), "") for form in JSON for encoding in ("utf-8-sig", "utf-16")),
+    *((colmap, file, encoded(encoding, "# a comment\n"), "") for file in ("cameras.txt", "images.txt", "points3D.txt")
+      for encoding in ("utf-8-sig", "utf-16")),
+    (colmap, "images.txt", text("\n\n", "\n1.5 2.5 -1 3 4 5 6.5 7 8 9 10 11\n"), ""),
+    (nerfstudio, "", entry(lambda meta: meta.update(w="48.0", h=36.0, fl_x=str(meta["fl_x"]))), ""),
+    (nerfstudio, "", nulls, ""),
+    (nerfstudio, "", camera_matrices, ""),
+    (nerfstudio, "", matrices(lambda pose: pose[:3]), ""),
+    (nerfstudio, "", matrices(lambda pose: pose / 8), "is divided by its last number, which is not 1"),
+    (instant_ngp, "", scaled(0.4), "scaled by 0.4"),
+    (blender, "", scaled(2.5), "scaled by 2.5"),
+    (blender, "", two_endings, ""),
+    (nerfstudio, "", scaled(2.5), "scaled by 2.5 in the poses of images/frame_00001.png, "),
+    (nerfstudio, "", pose(lambda part: 2.5 * part), "in the poses of images/frame_00004.png. The factor is divided"),
+    (nerfstudio, "", cloud("points\\Cloud.ply"), ""),
+    (nerfstudio, "", cloud("/home/me/room/points/cloud.ply"), ""),
+]  # fmt: skip
+BEFORE: dict[Callable[[Path], Path], list[torch.Tensor]] = {}  # what the room gives in each format
+
+
+@pytest.mark.parametrize(("form", "file", "change", "said"), SAME)
+def test_what_makes_no_difference(
+    capture: Path,
+    form: Callable[[Path], Path],
+    file: str,
+    change: Change,
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def views() -> list[torch.Tensor]:
+        manager = load_any(capture)
+        outputs, held = manager.train_dataparser_outputs, manager.eval_dataset
+        both = [getattr(each.cameras, name).double() for each in (outputs, held) for name in CAMERA_ENTRIES]
+        assert manager.cached_train[0]["image"].shape == (36, 48, 3) and "mask" not in manager.train_dataset.get_data(0)
+        return [*both, outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))]
+
+    place = form(capture)
+    before = BEFORE[form] = BEFORE.get(form) or views()
+    capsys.readouterr()
+    change(place / file if file else place)
+    for one, other in zip(before, views(), strict=True):
+        assert torch.allclose(one, other.to(one), atol=1e-6)
+    shown = printed(capsys)
+    assert said in shown and (said == OTHER_NAMES or "other names" not in shown)

@@ -115,7 +115,7 @@ def test_every_format_without_points(
     if form is colmap:
         (place / "points3D.txt").unlink()
     elif form is not blender:
-        edit(place, lambda meta: meta.pop("ply_file_path", None))
+        edit(place, lambda meta: meta.update(ply_file_path=None) if form is nerfstudio else meta)
     assert len(load_any(capture).train_dataparser_outputs.metadata["points3D_xyz"]) == 2
     (views,) = asked
     assert "2 points have been triangulated" in (text := printed(capsys))

@@ -1,18 +1,15 @@
 """Poses that are not rotations, and cameras far from the others."""
 
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from nerfstudio.data.dataparsers.blender_dataparser import BlenderDataParserConfig
-from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataParserConfig
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, rotations
-from tests.captures import edit, edit_frames, expect, load, load_with, printed, write_cloud
+from tests.captures import edit, expect, load, printed, write_cloud
 
 
 def pose_of(frame: dict[str, Any]) -> np.ndarray:
@@ -29,25 +26,6 @@ def change_poses(capture: Path, change: Any, only: int | None = None) -> None:
             frame["transform_matrix"] = pose.tolist()
 
     edit(capture, apply)
-
-
-@pytest.mark.parametrize("only", [None, 3])
-@pytest.mark.parametrize("center", ["poses", "focus"])
-def test_scaled_rotations_give_the_cameras_of_clean_ones(
-    capture: Path, capsys: pytest.CaptureFixture[str], only: int | None, center: str
-) -> None:
-    clean = load(capture, center_method=center)
-    change_poses(capture, lambda part: 2.5 * part, only)
-    capsys.readouterr()
-    scaled = load(capture, center_method=center)
-    assert torch.allclose(
-        scaled.train_dataset.cameras.camera_to_worlds, clean.train_dataset.cameras.camera_to_worlds, atol=1e-6
-    )
-    points = [m.train_dataparser_outputs.metadata["points3D_xyz"] for m in (scaled, clean)]
-    assert torch.allclose(*points, atol=1e-6)
-    message = printed(capsys)
-    assert message.count("scaled by 2.5 in the poses of") == 1 and "positions stay as they are" in message
-    assert ("in the poses of images/frame_00004.png. The" in message) == (only is not None)
 
 
 def test_rounded_matrices_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
@@ -72,67 +50,6 @@ def test_a_mirrored_capture_is_taken_and_a_mirrored_frame_is_named(
     load(capture)
     assert "images/frame_00004.png is mirrored against the other frames" in (message := printed(capsys))
     assert message.count("mirrored against") == 1
-
-
-def test_three_rows_are_enough(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    clean = load(capture).train_dataset.cameras.camera_to_worlds
-    edit_frames(capture, lambda frame: frame.update(transform_matrix=frame["transform_matrix"][:3]))
-    assert torch.equal(load(capture).train_dataset.cameras.camera_to_worlds, clean)
-    edit_frames(
-        capture, lambda f: f.update(transform_matrix=(np.array([*f["transform_matrix"], [0, 0, 0, 1]]) / 8).tolist())
-    )
-    assert torch.equal(load(capture).train_dataset.cameras.camera_to_worlds, clean)
-    assert "is divided by its last number, which is not 1" in printed(capsys)
-    edit_frames(capture, lambda frame: frame.update(transform_matrix=np.array(frame["transform_matrix"]).T.tolist()))
-    with expect("last row of the transform_matrix of images/frame_00001.png is .* not 0 0 0 1.*has to be transposed"):
-        load(capture)
-
-
-def blender(capture: Path, scale: float = 1.0, shear: float = 0.0, **common: Any) -> None:
-    """Write the capture in Blender's format; `common`: entries of each file."""
-    meta = json.loads((capture / "transforms.json").read_text())
-    frames = []
-    for i, frame in enumerate(meta["frames"]):
-        pose = pose_of(frame)
-        pose[:3, :3] *= scale
-        pose[:3, 0] += (i == 0) * shear * pose[:3, 1]
-        frames.append({"file_path": frame["file_path"][:-4], "transform_matrix": pose.tolist()})
-    for split, some in (("train", frames[:9]), ("val", frames[9:])):
-        more = common.get(split) or ({} if {"train", "val"} & common.keys() else common)
-        text = json.dumps({"camera_angle_x": 1.1, "frames": some, **more})
-        (capture / f"transforms_{split}.json").write_text(text, "utf-8-sig")
-
-
-def test_blenders_and_instant_ngps_poses_are_checked_as_well(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    blender(capture, 1.0, 0.0)
-    clean = load_with(capture, BlenderDataParserConfig()).train_dataset.cameras.camera_to_worlds
-    blender(capture, 2.5, 0.0)
-    scaled = load_with(capture, BlenderDataParserConfig()).train_dataset.cameras.camera_to_worlds
-    assert torch.allclose(scaled, clean, atol=1e-6) and "scaled by 2.5" in printed(capsys)
-    blender(capture, 1.0, 0.3)
-    with expect("transforms_train.json: the 3 x 3 part of the pose of images/frame_00001 is no rotation"):
-        load_with(capture, BlenderDataParserConfig())
-    ngp = InstantNGPDataParserConfig(eval_mode="interval")
-    clean = load_with(capture, ngp).train_dataset.cameras.camera_to_worlds
-    change_poses(capture, lambda part: 0.4 * part)
-    assert torch.allclose(load_with(capture, ngp).train_dataset.cameras.camera_to_worlds, clean, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("common", "message"),
-    [
-        ({"camera_angle_x": 39.6}, r"train.json: camera_angle_x is 39.6.*not degrees \(39.6 deg.* 0.69115\)"),
-        ({"camera_angle_x": True}, "camera_angle_x for all frames is True, which is no number"),
-        ({"camera_angle_x": 3.14159}, "focal length of .*_00001.png.*span 180 degrees.*camera_angle_x is in radia"),
-        ({"frames": None}, "transforms_train.json lists no frames"),
-        ({"train": {"frames": []}}, "transforms_train.json lists no frames"),
-        ({"val": {"frames": []}}, "transforms_val.json lists no frames.*move a few frames there"),
-    ],
-)
-def test_blenders_files_that_cannot_be_used(capture: Path, common: dict[str, Any], message: str) -> None:
-    blender(capture, **common)
-    with expect(message):
-        load_with(capture, BlenderDataParserConfig())
 
 
 def test_a_camera_far_from_all_others(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,6 @@
 """Captures that other programs misread or fail to read; each case in every format that can have it."""
 
 import json
-import unicodedata
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -175,46 +174,6 @@ def test_aria_s_camera(capture: Path) -> None:
 # names of photographs
 
 
-def name_frames(place: Path, change: Callable[[str], str]) -> None:
-    """Rename the photographs in the capture's file, relative to the capture's folder."""
-    if place.is_dir():
-        text = (place / "images.txt").read_text("utf8").split("\n")
-        for i in range(0, len(text) - 1, 2):
-            words = text[i].split(" ")
-            text[i] = " ".join([*words[:9], change(words[9])])
-        (place / "images.txt").write_text("\n".join(text), "utf8")
-    else:
-        edit_frames(place, lambda frame: frame.update(file_path=change(frame["file_path"])))
-
-
-NAMES = {
-    "case": lambda name: name.upper(),
-    "ending": lambda name: name.replace(".png", ".JPG"),
-    "no ending": lambda name: name.replace(".png", ""),
-    "backslashes": lambda name: ".\\" + name.replace("/", "\\"),
-    "absolute": lambda name: f"/home/somebody/project/{name}",
-    "drive": lambda name: "C:\\Users\\somebody\\" + name.replace("/", "\\"),
-    "unicode": lambda name: unicodedata.normalize("NFD", name),
-}
-
-
-@pytest.mark.parametrize("difference", NAMES)
-@pytest.mark.parametrize("form", PHOTOGRAPHS)
-def test_names_of_another_machine_or_program(
-    capture: Path, form: Callable[[Path], Path], difference: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    place = form(capture)
-    for path in images_of(capture):
-        path.rename(path.with_name(path.name.replace("frame_", "f\u00fcr_")))
-    name_frames(place, lambda name: NAMES[difference](name.replace("frame_", "f\u00fcr_")))
-    manager = load_any(capture)
-    assert len(manager.train_dataset) + len(manager.eval_dataset) == 12
-    assert {path.parent for path in manager.train_dataset.image_filenames} == {capture / "images"}
-    assert manager.cached_train[0]["image"].shape == (36, 48, 3)
-    told = "of 12 photographs have other names than it says" in printed(capsys)
-    assert told is (difference not in ("backslashes", "no ending"))
-
-
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_a_name_that_is_nearly_there(capture: Path, form: Callable[[Path], Path]) -> None:
     place = form(capture)
@@ -303,15 +262,6 @@ def test_what_needs_no_photographs_opens_none(capture: Path, form: Callable[[Pat
 
 
 # Blender's files
-
-
-def test_blenders_names_with_two_endings(capture: Path) -> None:
-    """nerfstudio's reader appends .png to all of them."""
-    place = blender(capture)
-    for path in images_of(capture):
-        path.rename(path.with_name(f"{path.stem}.jpg.png"))
-    name_frames(place, lambda name: f"./{name.replace('.png', '.jpg')}")
-    assert load_any(capture).train_dataset.image_filenames[0].name == "frame_00002.jpg.png"
 
 
 @pytest.mark.parametrize("lacking", ["all", "some"])

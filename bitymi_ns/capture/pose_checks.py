@@ -32,7 +32,7 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
     largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares of the numbers may overflow
-    usable = finite & (largest > 0.0)
+    usable = largest > 0.0
     unit = np.where(usable[:, None, None], matrices, 1.0) / np.where(usable, largest, 1.0)[:, None, None]
     length = np.sqrt(np.square(unit).sum((1, 2)) / 3.0)
     scale, unit = largest * length, unit / length[:, None, None]
@@ -47,8 +47,8 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
         ("is sheared or stretched: its columns are not at right angles and equally long", usable & (error > ROUNDED)),
     ):
         if wrong.any():
-            advice = "Correct the pose or remove the frame."
-            fail(f"{source}: the 3 x 3 part of the pose of {named(wrong)} is no rotation, it {what}. {advice}")
+            part = f"the 3 x 3 part of the pose of {named(wrong)} is no rotation, it {what}"
+            fail(f"{source}: {part}. Correct the pose or remove the frame.")
     scaled = np.abs(scale - 1.0) > EXACT
     result[scaled] = unit[scaled]
     rounded = error > EXACT

@@ -113,13 +113,14 @@ def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split
 
 
 def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
-    """Split by a capture's own lists; "val" and "test" are held out."""
+    """Split by a capture's own lists; "val" and "test" are held out, without them what is not in "train"."""
 
     def indices(split: str) -> set[int]:  # downscaled photographs are in another folder than the lists state
         return set(find_named(names, lists.names.get(split, []), lists.source, any_folder=True))
 
-    held_out = indices("val") | indices("test")
-    train = indices("train") if "train" in lists.names else set(range(len(names))) - held_out
+    every, train, held_out = set(range(len(names))), indices("train"), indices("val") | indices("test")
+    held_out = held_out if lists.names.keys() - {"train"} else every - train
+    train = train if "train" in lists.names else every - held_out
     return Split(sorted(train), sorted(held_out), f"by {lists.source}")
 
 

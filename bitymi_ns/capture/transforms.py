@@ -34,6 +34,7 @@ from bitymi_ns.trust import listed
 HOW_TO_GET_ONE = "Give a folder of photographs or a video: their poses are found."
 HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write it again."
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
+LISTS = {f"{split}_filenames": split for split in ("train", "val", "test")}  # of names of photographs
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")
 LATLONG = ("latlong", "is_latlong")
 """instant-ngp's entries for 360-degree pictures with latitude and longitude along their sides."""
@@ -90,7 +91,7 @@ def read_transforms(
                     f"{path}: {key} is set, by which instant-ngp means pictures whose rows show equal areas, which "
                     'cannot be read. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.'
                 )
-    lists = {split: meta.pop(f"{split}_filenames", None) for split in ("train", "val", "test")}
+    lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
     names = [frame["file_path"] for frame in frames]
     files = find_photographs(path, names, need_photos)
     masks = find_masks(path.parent, [frame.get("mask_path") if use_masks else None for frame in frames], files,
@@ -125,8 +126,7 @@ def read_transforms(
     if downscale > 1:
         photographs = downscaled(photographs, path.parent, downscale)
     named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
-    stated = {split: names for split, names in lists.items() if names is not None}
-    return Transforms(path, meta, photographs, NameLists(stated), named)
+    return Transforms(path, meta, photographs, NameLists(lists), named)
 
 
 def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
@@ -143,7 +143,9 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
             for key, (i, j) in OF_MATRIX.items() if matrix else ():
                 holder.setdefault(key, matrix[i][j])
         _check_applied(path, meta)
-        _check_lists(path, meta)
+        for key in [key for key in LISTS if key in meta]:
+            if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
+                fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it or remove it.")
         correct_poses(path, meta["frames"])
     return meta
 
@@ -219,33 +221,14 @@ def _check_applied(path: Path, meta: dict[str, Any]) -> None:
     """Check the transform [3, 4], made [4, 4] here, and the scale that were applied to the whole capture."""
     if "applied_transform" in meta:
         transform = as_matrix(meta["applied_transform"])
-        singular = "maps the capture to a plane, a line or a point, which cannot be undone"
         if transform is None or abs(np.linalg.det(transform[:3, :3])) < 1e-12:
-            fault = "is not a matrix of 3 x 4 finite numbers" if transform is None else singular
+            fault = "is not a matrix of 3 x 4 finite numbers that can be undone"
             fail(f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in this file's frame.")
         meta["applied_transform"] = transform
     if "applied_scale" in meta:
         scale = check_number(path, "applied_scale", meta["applied_scale"], "for all frames")
         if not 0.0 < scale < math.inf:
             fail(f"{path}: applied_scale is {scale}, which is no positive number. Correct it or remove it.")
-
-
-def _check_lists(path: Path, meta: dict[str, Any]) -> None:
-    """Check the lists of names for training and evaluation: all or none."""
-    keys = [f"{split}_filenames" for split in ("train", "val", "test")]
-    stated = [key for key in keys if key in meta]
-    if not stated:
-        return
-    for key in stated:
-        if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
-            fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it or remove it.")
-    if stated[0] != keys[0] or len(stated) == 1:
-        fail(
-            f"{path} has {', '.join(stated)}, but a split needs train_filenames and val_filenames (or test_filenames). "
-            "Add what is missing, or remove the lists to have views held out by --eval-mode."
-        )
-    for key, other in ((keys[1], keys[2]), (keys[2], keys[1])):
-        meta.setdefault(key, meta.get(other))
 
 
 def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ColmapCamera:

@@ -57,10 +57,11 @@ def test_doubtful_focal_lengths_are_said(capture: Path, capsys: pytest.CaptureFi
     assert "is 4.2 pixels (fl_x): 48 pixels of the picture span 160 deg" in message
 
 
-@pytest.mark.parametrize("given", ["val_filenames", "test_filenames"])
-def test_lists_of_two_splits_are_enough(capture: Path, given: str) -> None:
+@pytest.mark.parametrize("given", ["train", "val", "test", "train val", "train test"])
+def test_one_list_is_enough(capture: Path, given: str) -> None:
     names = [f"images/{path.name}" for path in images_of(capture)]
-    edit(capture, lambda meta: meta.update({"train_filenames": names[2:], given: names[:2]}))
+    lists = {f"{split}_filenames": names[2:] if split == "train" else names[:2] for split in given.split()}
+    edit(capture, lambda meta: meta.update(lists))
     manager = load(capture)
     assert held_out(manager) == ["frame_00001.png", "frame_00002.png"]
     assert len(manager.train_dataset) == 10

@@ -1,5 +1,6 @@
 """The table of what files are: every row takes effect in a capture, and docs/capture.md prints it."""
 
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,12 +13,12 @@ from bitymi_ns.capture.sfm_photos import find_photos
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/capture.md"
 TABLES = {
-    "pictures": PICTURES,
-    "folders": FOLDERS,
-    "what is in a folder of results": RESULTS,
-    "formats that are not read": UNREAD,
-    "poses that are not read": POSES,
-    "models, and their pictures": IMAGES_OF,
+    "Pictures": PICTURES,
+    "Folders": FOLDERS,
+    "Folders with": RESULTS,
+    "Not read": UNREAD,
+    "Poses, not read": POSES,
+    "Pictures of models": IMAGES_OF,
 }
 
 
@@ -36,13 +37,11 @@ def save(path: Path) -> None:
 
 
 def test_the_page_prints_the_table() -> None:
-    lines = []
+    page = " ".join(PAGE.read_text("utf8").split())
     for title, table in TABLES.items():
-        lines += ["", f"| {title} | |", "|---|---|"]
-        for row in table:
-            beside = f" beside `{row.of}`" if row.of else ""
-            lines.append(f"| `{row.names}`{beside} | {row.what} |")
-    assert "\n".join(lines) in PAGE.read_text("utf8"), "\n".join(lines)
+        rows = (f"{row.what} (`{row.names}`{f' beside `{row.of}`' if row.of else ''})" for row in table)
+        line = f"- {title}: {', '.join(rows)}"
+        assert line in page, textwrap.fill(line, 120, subsequent_indent="  ", break_on_hyphens=False)
 
 
 @pytest.mark.parametrize(("row", "name", "whose"), list(of(PICTURES)))

@@ -79,9 +79,12 @@ OTHERS = (
     Kind("meta_data.json", "of sdfstudio", use="give `sdfstudio-data` after the options of the method"),
 )
 """Files that are no captures, but lead to some."""
-_PROCESS = "`ns-process-data {0} --num-downscales 0 --output-dir NEW` converts it"
+_PROCESS = "`ns-process-data {0} --output-dir NEW`, which needs the program ffmpeg, converts it"
 _COLMAP = "`{0}` writes a COLMAP model"
-_MATRICES = "write each as 4 x 4 numbers, camera to world with OpenCV axes, to `pose/NAME.txt` beside `rgb/NAME.png`"
+_MATRICES = (
+    "write each as 4 x 4 numbers, camera to world with OpenCV axes, to `pose/NAME.txt` beside `rgb/NAME.png`, and the "
+    "camera matrix to `intrinsics.txt`"
+)
 POSES = (
     Kind("*.xml", "Metashape", use=_PROCESS.format("metashape --data IMAGES --xml FILE"), mark=b"<camera "),
     Kind("*.csv", "RealityCapture", use=_PROCESS.format("realitycapture --data IMAGES --csv FILE"), mark=b"#name,x,y"),
@@ -90,8 +93,9 @@ POSES = (
     Kind("reconstruction.json", "OpenSfM", use=_COLMAP.format("opensfm export_colmap")),
     Kind("sfm_data.json", "OpenMVG", use=_COLMAP.format("openMVG_main_openMVG2Colmap -i FILE -o sparse/0")),
     Kind("cameras.sfm", "Meshroom", use=_COLMAP.format("aliceVision_exportColmap -i FILE -o NEW")),
-    Kind("bundle.out bundle.rd.out", "Bundler"), Kind("*.nvm", "VisualSFM"), Kind("poses_bounds.npy", "LLFF"),
-    Kind("cameras_sphere.npz", "NeuS"), Kind("cameras.npz", "IDR"),
+    Kind("bundle.out bundle.rd.out", "Bundler", use=_MATRICES), Kind("*.nvm", "VisualSFM", use=_MATRICES),
+    Kind("poses_bounds.npy", "LLFF", use=_MATRICES), Kind("cameras_sphere.npz", "NeuS", use=_MATRICES),
+    Kind("cameras.npz", "IDR", use=_MATRICES),
     Kind("poses.txt traj.txt", "KITTI or Replica", use=_MATRICES),
     Kind("groundtruth.txt cameratrajectory.txt keyframetrajectory.txt", "TUM", use=_MATRICES),
     Kind("geo.txt", "positions of ODM", use="write them to the photographs' EXIF, as with exiftool", mark=b"EPSG"),

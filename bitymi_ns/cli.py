@@ -58,14 +58,11 @@ class Sfm:
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
-        from bitymi_ns.capture.folder_contents import passed_over
         from bitymi_ns.capture.frame import gps_line
         from bitymi_ns.capture.nerfstudio import write_capture
         from bitymi_ns.capture.poses import find_poses
         from bitymi_ns.progress import rich_progress
 
-        if others := passed_over(self.source):
-            say(f"Not taken for photographs in {self.source}: {listed(others, most=12)}.", sys.stderr)
         with rich_progress() as progress:
             poses = find_poses(self.source, self.options, progress, lambda text: say(text, sys.stderr))
             if self.output is not None:

@@ -160,20 +160,22 @@ def is_rendered_film(path: Path) -> bool:
     return path.suffix.lower() in kinds.VIDEOS and holds(path, kinds.RENDERED)
 
 
-def passed_over(folder: Path, used: Collection[Path] | None = None, copies: str | None = None) -> list[str]:
-    """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out; given
-    the `used` files, also other photographs in their folders and one level below. Folders whose names end in `copies`
-    are left out: smaller copies, such as `images_2`."""
+def passed_over(
+    folder: Path, used: Collection[Path] | None = None, copies: str | None = None, masks: Collection[Path] = ()
+) -> list[str]:
+    """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out, but
+    `masks`; given the `used` files, also other photographs in their folders and one level below. Folders whose names
+    end in `copies` are left out: smaller copies, such as `images_2`."""
     # a folder of captures may hold a whole disk
     among = None if used is None else {above for path in used for above in path.parents}
     groups: dict[tuple[Kind | None, Path, str], list[Path]] = defaultdict(list)
-    found = []
+    found, known = [], {*(used or ()), *masks}
     for path, kind in look_in(folder, among):
         if kind is not None and path.is_dir():
-            count = sum(is_picture(each) and each not in (used or ()) for each in path.rglob("*"))
+            count = sum(is_picture(each) and each not in known for each in path.rglob("*"))
             if count and not (copies and path.name.endswith(copies)):
                 found.append(f"{path.relative_to(folder)} ({kind.what}: {count}{_use(kind)})")
-        elif path not in (used or ()) and (used is not None or kind is not None):
+        elif path not in known and (used is not None or kind is not None):
             groups[kind, path.parent, path.suffix.lower() if kind in kinds.UNREAD else ""].append(path)
     for (kind, parent, ending), paths in groups.items():
         if kind is None:

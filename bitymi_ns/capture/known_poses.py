@@ -11,8 +11,7 @@ import numpy as np
 
 from bitymi_ns.capture.cache import content_key, made_once, replace_stale
 from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.folder_contents import open_picture
-from bitymi_ns.capture.image_files import eight_bits, image_size, in_srgb
+from bitymi_ns.capture.image_files import from_header, image_size, read_image
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.prepare import colmap_mask, emptied
 from bitymi_ns.capture.sfm import process
@@ -92,19 +91,12 @@ def _job(stated: Sequence[str], views: Sequence[Photograph], poses: list[list[li
     groups: dict[ColmapCamera, list[str]] = defaultdict(list)
     names = {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
-        suffix = view.file.suffix.lower()
-        try:
-            with open_picture(view.file) as image:
-                converted = None if is_plain(image, view.file) else in_srgb(eight_bits(image)).convert("RGB")
-        except MemoryError:
-            raise
-        except Exception as error:
-            raise CaptureError(f"{view.file} cannot be read as a picture: save it again") from error
-        plain = f"{i:06d}{suffix if converted is None else '.png'}"
-        if converted is None:
+        if from_header(view.file, lambda image, file=view.file: is_plain(image, file), False):
+            plain = f"{i:06d}{view.file.suffix.lower()}"
             (links / plain).symlink_to(view.file.resolve())
         else:
-            converted.save(links / plain)
+            plain = f"{i:06d}.png"
+            read_image(view.file).convert("RGB").save(links / plain)
         groups[view.camera].append(plain)
         names[plain] = name
         if view.mask is not None and os.path.isfile(view.mask):

@@ -15,9 +15,9 @@ from pydantic import TypeAdapter
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
 from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.folder_contents import photo_folder, refusal, unreadable_in, videos_in
+from bitymi_ns.capture.folder_contents import passed_over, photo_folder, refusal, unreadable_in, videos_in
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
-from bitymi_ns.capture.kinds import VIDEOS
+from bitymi_ns.capture.kinds import FILM, VIDEOS
 from bitymi_ns.capture.masks import find_masks, mask_folder
 from bitymi_ns.capture.prepare import IMAGES, colmap_mask, emptied, upright_photos
 from bitymi_ns.capture.recognise import is_model
@@ -30,6 +30,7 @@ from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.safe_reading import read_json
+from bitymi_ns.trust import listed
 
 GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
 TELLING = 0.25  # least share of what looks like 360-degree pictures among photographs for all of them to be some
@@ -46,7 +47,7 @@ def find_poses(
 
     Args:
         source: a folder of photographs, a folder with `images` (and `masks`), or a video.
-        warn: called with the location of the result if not beside writable photographs.
+        warn: called with what is left out, and the location of the result if not beside writable photographs.
     """
     options = options or SfmOptions()
     tell = progress or no_progress
@@ -61,6 +62,12 @@ def find_poses(
         if not masks and where is not None:
             advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out"
             raise CaptureError(f"no mask in {where} belongs to a photograph: {advice} (--use-masks False)")
+    if source.is_dir():
+        others = passed_over(source, masks=masks.values())
+    else:
+        others = [f"{film.name} ({FILM.what})" for film in videos_in(source.parent, rendered=True)]
+    if others:
+        warn(f"Not taken for photographs in {source}: {listed(others, most=12)}.")
     inputs = [(name, folder / name) for name in names] or [(source.name, source)]
     inputs += [(f"masks/{name}", path) for name, path in masks.items()]
     settings = {**asdict(options), "masks": bool(masks)}

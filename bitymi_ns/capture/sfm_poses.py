@@ -11,10 +11,9 @@ from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.colmap_views import Origin, Source
-from bitymi_ns.capture.folder_contents import passed_over, photo_folder, videos_in
+from bitymi_ns.capture.folder_contents import photo_folder
 from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
-from bitymi_ns.capture.kinds import FILM
 from bitymi_ns.capture.masks import mask_folder
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
@@ -54,12 +53,6 @@ def find_sfm_source(
     if use_masks and found.format != "video":
         stated = None if masks_path is None else found.folder / masks_path
         masks = mask_folder(photo_folder(found.path), found.folder, stated)
-    if found.format == "photographs":
-        others = passed_over(found.path)
-    else:
-        others = [f"{film.name} ({FILM.what})" for film in videos_in(found.path.parent, rendered=True)]
-    if others:
-        say(f"Not taken for photographs in {found.folder}: {listed(others, most=12)}.")
     with rich_progress() as progress:
         options = SfmOptions(**asdict(settings), masks=masks, use_masks=use_masks)
         poses = find_poses(found.path, options, progress, warn)

@@ -73,7 +73,10 @@ def test_other_processors_get_the_compilers_default(tmp_path: Path) -> None:
 
 
 OLD, NEW = "compute_50 compute_75 compute_86 compute_90", "compute_75 compute_90 compute_103 compute_120"
-REFUSES = "case $2 in g++-11) exit 0;; *) echo '#error -- unsupported GNU version! later than 11' >&2; exit 1;; esac"
+REFUSED = (
+    "a.h:132:2: error: #error -- unsupported GNU version! later than 11! The nvcc flag -allow can be used. At risk."
+)
+REFUSES = f"case $2 in g++-11) exit 0;; *) echo '{REFUSED}' >&2; exit 1;; esac"
 FAILS = "echo 'fatal error: no lib' >&2; exit 1"
 
 
@@ -92,7 +95,7 @@ FAILS = "echo 'fatal error: no lib' >&2; exit 1"
         ("11.8", OLD, "", "6.1", "", "a card of compute capability 61 cannot be used: the kernels need 75"),
         ("11.8", OLD, "", "6.1\\n8.6", "86", "a card of compute capability 61 cannot be used"),
         ("11.8", OLD, REFUSES, "8.6", "86", "host g++-11"),
-        ("11.8", OLD, REFUSES.replace("g++-11", "no"), "8.6", "", "cannot compile with BIN/g++: #error -- unsupported"),
+        ("11.8", OLD, REFUSES.replace("g++-11", "no"), "8.6", "", "unsupported GNU version! later than 11: install"),
         ("11.8", OLD, FAILS, "8.6", "", "cannot compile with BIN/g++: fatal error: no lib: install a g++"),
     ],
 )  # fmt: skip

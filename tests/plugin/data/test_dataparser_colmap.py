@@ -167,27 +167,6 @@ def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytes
     )
 
 
-def test_a_name_as_long_as_the_system_allows(project: Path) -> None:
-    path, name, model = images_of(project)[0], "a" * 251 + ".png", project / "sparse/0/images.txt"
-    path.rename(path.with_name(name))
-    model.write_text(model.read_text().replace(path.name, name))
-    save_masks(project, 255)
-    assert "mask" in load_any(project).cached_train[0]
-    model.write_text(model.read_text().replace(name, f"a{name}"))
-    with expect(r"1 of 12 photographs of .* are missing:\s+.*/aaaa"):
-        load_any(project)
-
-
-def test_photographs_of_the_model_that_are_not_there(project: Path) -> None:
-    images_of(project)[3].unlink()
-    with expect(r"1 of 12 photographs of .* are missing:\s+.*frame_00004.png"):
-        load_any(project)
-    for path in images_of(project):
-        path.unlink()
-    with expect("frame_00001.png, .* and 9 more, which are in none of the folders of .*--images-path"):
-        load_any(project)
-
-
 @pytest.mark.parametrize("name", ["input", "holiday 2024", "."])
 def test_photographs_are_found_where_they_are(project: Path, name: str) -> None:
     for path in images_of(project):
@@ -201,15 +180,3 @@ def test_photographs_are_found_where_they_are(project: Path, name: str) -> None:
 def test_the_model_itself_may_be_given(project: Path) -> None:
     for given in (project / "sparse/0", project / "sparse/0/cameras.txt"):
         assert load_any(given).train_dataset.image_filenames[0].parent == project / "images"
-
-
-def test_one_image_and_one_place(project: Path) -> None:
-    path = project / "sparse/0/images.txt"
-    lines = path.read_text().split("\n")
-    same = [" ".join([*line.split()[:5], "0 0 0", *line.split()[8:]]) if line else "" for line in lines]
-    path.write_text("\n".join(same))
-    with expect("all cameras are at one place"):
-        load_any(project)
-    path.write_text("\n".join(lines[:2]) + "\n")
-    with expect("has one image only"):
-        load_any(project)

@@ -137,6 +137,10 @@ def names(change: Callable[[str], str]) -> Change:
     return apply
 
 
+def one_place(path: Path) -> None:
+    path.write_text(re.sub(r"^((\S+ ){5})\S+ \S+ \S+", r"\g<1>0 0 0", path.read_text(), flags=re.MULTILINE))
+
+
 def two_endings(path: Path) -> None:
     for file in images_of(path.parent):
         file.rename(file.with_name(f"{file.stem}.jpg.png"))
@@ -276,6 +280,11 @@ MODEL: list[tuple[str, Change, str]] = [
      "images.txt: the pose of image 1 .* is not finite, or its rotation is zero"),
     *(("images.txt", line(0, lambda words, cut=cut: [*words[:cut], *words[8:]]),
        IMAGES + f"image 1 has {cut - 1} numbers for its pose instead of 7") for cut in (3, 5, 6, 7)),
+    ("images.txt", text("_00001.png", f"{'a' * 252}.png"), r"1 of 12 photographs of .* are missing:\s+.*/frameaaaa"),
+    ("images.txt", lambda path: path.write_text(path.read_text().partition("\n")[0]), "has one image only"),
+    ("images.txt", one_place, "all cameras are at one place"),
+    ("../../images", lambda path: [file.unlink() for file in path.iterdir()],
+     "frame_00001.png, .* and 9 more, which are in none of the folders of .*--images-path"),
     ("points3D.txt", text("200", "red"), "points3D.txt cannot be read: .*red"),
     ("points3D.txt", content("1 0 0 0.5 200 10 10\n2 0.1 0 0.5\n"),
      "points3D.txt cannot be read: .*three coordinates and three colors"),

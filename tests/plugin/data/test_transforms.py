@@ -25,14 +25,6 @@ def test_names_do_not_control_the_terminal(capsys: pytest.CaptureFixture[str]) -
     assert str(InputError("\x1b]0;x\x07")) == "bitymi: \\x1b]0;x\\x07"
 
 
-def test_a_name_as_long_as_the_system_allows(capture: Path) -> None:
-    path = images_of(capture)[0]
-    named = path.rename(path.with_name("a" * 251 + ".png"))
-    edit(capture, lambda meta: meta["frames"][0].update(file_path=f"images/{named.name}"))
-    save_masks(capture, 255)
-    assert "mask" in load(capture).cached_train[0]
-
-
 def test_a_frame_with_a_camera_of_its_own(capture: Path) -> None:
     path = images_of(capture)[5]
     Image.open(path).resize((96, 72)).save(path)

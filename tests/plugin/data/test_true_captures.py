@@ -16,8 +16,8 @@ from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.export.trained import world_of
-from tests.captures import edit, edit_frames, expect, images_of, load_any, printed, write_cloud
-from tests.formats import JSON, PHOTOGRAPHS, blender, instant_ngp
+from tests.captures import edit, edit_frames, expect, images_of, load_any, printed, save_masks, write_cloud
+from tests.formats import JSON, PHOTOGRAPHS, blender, colmap, instant_ngp, nerfstudio
 
 UTM = np.array([500123.0, 4649876.0, 312.0])
 
@@ -217,6 +217,17 @@ def test_photographs_outside_of_the_capture_are_named(
     edit(place, lambda meta: meta["frames"][3].update(file_path=str(tmp_path / "elsewhere.png")))
     load_any(capture)
     assert f"names pictures outside of its folder, which are read there: {tmp_path}/elsewhere.png." in printed(capsys)
+
+
+@pytest.mark.parametrize("form", [nerfstudio, colmap])
+def test_a_name_as_long_as_the_system_allows(capture: Path, form: Callable[[Path], Path]) -> None:
+    place = form(capture)
+    file = place / "images.txt" if place.is_dir() else place
+    path = images_of(capture)[0]
+    named = path.rename(path.with_name("a" * 251 + ".png"))
+    file.write_text(file.read_text().replace(path.name, named.name))
+    save_masks(capture, 255)
+    assert "mask" in load_any(capture).cached_train[0]
 
 
 # files of a model, and sizes

@@ -196,21 +196,17 @@ class _Reader:
     def _transforms(self) -> Capture:
         """Read a transforms.json."""
         options, found = self.options, self.found
-        read = self._read_transforms(found.path)
-        if self.need_photos:
-            check_photographs_exist(read.path, [each.file for each in read.photographs])
-        photographs, source = read.photographs, str(found.path)
+        read, source = self._read_transforms(found.path), str(found.path)
         meta, frame = read.meta, options
         earlier = found.folder / "colmap/sparse/0"  # points of nerfstudio's tool before it stated either
         applied, own = meta.get("applied_transform"), None
         if applied is None and earlier.is_dir():
             applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-        what, auto = f"{source} ({found.format}, {len(photographs)} photographs)", options.points == "auto"
+        what, auto = f"{source} ({found.format}, {len(read.photographs)} photographs)", options.points == "auto"
         model = read_model(earlier) if auto and "ply_file_path" not in meta and is_model(earlier) else None
         if model is not None:
             what += f", points of {earlier}"
-        self._check(what, photographs, read.named)
-        photographs = self._as_meant(photographs, source)
+        photographs = self._checked(what, read.photographs, read.named, source)
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * check_number(read.path, "aabb_scale", meta.get("aabb_scale", 1), "for all frames")
             if not 0.0 < half < math.inf:
@@ -246,10 +242,8 @@ class _Reader:
             photographs = with_masks(
                 photographs, found.folder, base, options.masks_path, source.downscale, source.image_folder
             )
-        masked = {*named, *(each.mask for each in photographs)} if found.format == "colmap" else None
-        self._check(source.describe(), photographs, masked)
-        if found.format == "colmap":
-            photographs = self._as_meant(photographs, where)
+        named |= {each.mask for each in photographs if each.mask is not None}
+        photographs = self._checked(source.describe(), photographs, named, where)
         own = model_points(model, TO_Z_UP)
         if need_photos and self.want_points and options.points == "auto":
             own = self._colored(own, model.without_colors, photographs, source.folder)
@@ -267,8 +261,8 @@ class _Reader:
         if self.need_photos and self.options.use_masks:
             photographs = with_masks(photographs, found.folder, None, self.options.masks_path, self.downscale)
         named = {file for each in photographs for file in (each.file, each.mask)}
-        self._check(f"{source} ({found.format}, {len(photographs)} photographs with their poses)", photographs, named)
-        photographs = self._as_meant(photographs, source)
+        what = f"{source} ({found.format}, {len(photographs)} photographs with their poses)"
+        photographs = self._checked(what, photographs, named, source)
         points = self._points(None, photographs, source)
         lists = lists_by_name([each.file for each in photographs] if found.format == "pose-files" else [])
         return Capture(found.format, source, photographs, points, self.options, lists, downscale=self.downscale)
@@ -278,8 +272,6 @@ class _Reader:
         photographs, the other serves for both; without either there is no split."""
         options, found, need_photos = self.options, self.found, self.need_photos
         train = self._read_transforms(found.folder / "transforms_train.json")
-        if need_photos:
-            check_photographs_exist(train.path, [each.file for each in train.photographs])
         parts: dict[str, list[Photograph]] = {"train": train.photographs}
         named = set(train.named)
         for name in ("val", "test"):
@@ -292,8 +284,7 @@ class _Reader:
                     warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, {left}.")
                 named |= part.named
         source, every = str(train.path), [each for part in parts.values() for each in part]
-        self._check(f"{train.path} (blender, {len(train.photographs)} photographs)", every, named)
-        every = self._as_meant(every, source)
+        every = self._checked(f"{source} (blender, {len(train.photographs)} photographs)", every, named, source)
         numbers, start = {}, 0
         for name, part in parts.items():
             numbers[name] = range(start, start + len(part))
@@ -305,19 +296,22 @@ class _Reader:
         points = self._points(None, used, source)
         return Capture(found.format, source, every, points, frame, parts=numbers, downscale=self.downscale)
 
-    def _check(self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None] | None) -> None:
-        """Report what is read, check its masks, and report pictures beside the `named` ones (None = do not)."""
+    def _checked(
+        self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None], source: str
+    ) -> list[Photograph]:
+        """Report what is read; fail if photographs or masks are missing. If it came with poses, report pictures beside
+        the `named` ones, and give photographs the poses that they are meant to have; see `as_meant`."""
         text = f"Reading {what}. {self.found.how_to_choose()}"
         if self.found.format == "instant-ngp" and self.options.format == "auto":  # a guess: both use one name
             text = f"{text.rstrip()} If nerfstudio wrote it: `bitymi-data --format nerfstudio`."
         say(text.rstrip())
         if self.need_photos:
+            check_photographs_exist(Path(source), [each.file for each in photographs])
             check_masks(photographs)
-            if named is not None:
-                name_unused(self.found.folder, named, self.options.downscale_factor)
-
-    def _as_meant(self, photographs: Sequence[Photograph], source: str) -> list[Photograph]:
-        """Give photographs the poses that they are meant to have; see `as_meant`."""
+        if self.found.format in ("photographs", "video"):
+            return list(photographs)
+        if self.need_photos:
+            name_unused(self.found.folder, named, self.options.downscale_factor)
         convention, asked = CONVENTIONS.get(self.found.format, (Reading(), np.eye(4))), self.options.poses_as
         asked = asked if asked != AUTO or self.need_photos else WRITTEN
         meant, self.mirror, self.poses_as = as_meant(photographs, *convention, source, asked)

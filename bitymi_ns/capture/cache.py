@@ -128,6 +128,13 @@ def keep_work_folder(work: Path) -> None:
         atexit.register(locks.release, mark)
 
 
+def emptied(folder: Path) -> Path:
+    """Make an empty folder, or empty an existing one."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    return folder
+
+
 def user_cache() -> Path | None:
     """Return the user's cache folder; None = unknown."""
     with suppress(RuntimeError):  # there is no HOME, and the system does not know the user

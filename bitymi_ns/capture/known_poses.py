@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bitymi_ns.capture.cache import content_key, made_once, replace_stale
+from bitymi_ns.capture.cache import content_key, emptied, made_once, replace_stale
 from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.capture.image_files import from_header, image_size, read_image
+from bitymi_ns.capture.masks import colmap_mask
 from bitymi_ns.capture.points import Points
-from bitymi_ns.capture.prepare import colmap_mask, emptied
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.sfm_photos import check_names, is_plain
@@ -100,7 +100,7 @@ def _job(stated: Sequence[str], views: Sequence[Photograph], poses: list[list[li
         groups[view.camera].append(plain)
         names[plain] = name
         if view.mask is not None and os.path.isfile(view.mask):
-            colmap_mask(view.mask, view.file.name, view.camera.size).save(masks / f"{plain}.png")
+            colmap_mask(view.mask, view.camera.size).save(masks / f"{plain}.png")
     mask_folder = str(masks.resolve()) if any(masks.iterdir()) else None
     cameras = [CameraGroup(camera, True, members) for camera, members in groups.items()]
     placed = dict(zip(names, poses, strict=True))

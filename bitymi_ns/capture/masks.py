@@ -161,3 +161,11 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
         size = known or checked_mask(mask).size  # fails with the reason
         if not in_proportion(size, photograph.camera.size):
             fail(f"{wrong_size(mask, size, photograph.camera.size)} {LEAVE_OUT[0].upper()}{LEAVE_OUT[1:]}.")
+
+
+def colmap_mask(path: Path, size: tuple[int, int]) -> Image.Image:
+    """Read the mask of an upright photograph of this `size` for COLMAP: grey, of that size."""
+    mask = checked_mask(path)
+    if not in_proportion(mask.size, size):
+        fail(wrong_size(path, mask.size, size))
+    return mask.resize(size, Image.Resampling.NEAREST).convert("L")

@@ -12,19 +12,18 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.cache import content_key, replace_stale, work_folder
+from bitymi_ns.capture import pycolmap, sfm_photos
+from bitymi_ns.capture.cache import content_key, emptied, replace_stale, work_folder
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.folder_contents import passed_over, photo_folder, refusal, unreadable_in, videos_in
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.kinds import FILM, VIDEOS
-from bitymi_ns.capture.masks import find_masks, mask_folder
-from bitymi_ns.capture.prepare import IMAGES, colmap_mask, emptied, upright_photos
+from bitymi_ns.capture.masks import colmap_mask, find_masks, mask_folder
 from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.sfm_photos import ALIKE, Photo, blurred, check_names, duplicates, find_photos, read_photos
+from bitymi_ns.capture.sfm_photos import Photo
 from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, FoundPoses, SfmOptions, is_full_sphere
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file
@@ -52,7 +51,7 @@ def find_poses(
     options = options or SfmOptions()
     tell = progress or no_progress
     source, folder, names = _photographs_in(Path(source))
-    check_names(folder, names)
+    sfm_photos.check_names(folder, names)
     masks: dict[str, Path] = {}
     if options.use_masks and names:
         where = mask_folder(folder, source, options.masks)
@@ -93,7 +92,7 @@ def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
     if not source.is_dir():
         raise CaptureError(f"{source} is neither a folder of photographs nor a video ({', '.join(VIDEOS)})")
     folder = photo_folder(source)
-    names = find_photos(folder)
+    names = sfm_photos.find_photos(folder)
     videos = videos_in(source)
     if not names and len(videos) == 1:
         return videos[0], videos[0], []
@@ -114,7 +113,7 @@ def _finished(work: Path, folder: Path) -> FoundPoses | None:
     try:
         kept = read_json(result / "poses.json")
         made = kept.pop("made")  # photographs of the model are copies or frames in the work folder
-        images = work / IMAGES if made else Path(os.path.abspath(folder))
+        images = work / sfm_photos.IMAGES if made else Path(os.path.abspath(folder))
         values = {**kept, "model": result / SPARSE, "images": images, "report": result}
         poses = TypeAdapter(FoundPoses).validate_python(values)
     except Exception:  # damaged in any way
@@ -138,12 +137,12 @@ def _find(
     given, video = len(names), not names
     if video:
         folder = extract_frames(source, work, options.frames, tell)
-        names = find_photos(folder)
+        names = sfm_photos.find_photos(folder)
         given, seconds["taking frames"] = len(names), time.monotonic() - begun
     read = time.monotonic()
-    photos, left_out = read_photos(folder, names, tell)
+    photos, left_out = sfm_photos.read_photos(folder, names, tell)
     photos = _with_panoramas(folder, photos, left_out, options.camera_model, warn)
-    twins = duplicates(photos)
+    twins = sfm_photos.duplicates(photos)
     left_out |= {name: f"the same as {twin}" for name, twin in twins.items()}
     photos = [photo for photo in photos if photo.name not in twins]
     seconds["reading photographs"] = time.monotonic() - read
@@ -160,12 +159,12 @@ def _find(
         raise CaptureError(f"of the {whose}, only {len(photos)} {use} ({some}): {then}")
     photos = ordered(photos)
     started = time.monotonic()
-    images, used = upright_photos(photos, folder, work, tell)
+    images, used = sfm_photos.upright_photos(photos, folder, work, tell)
     job = make_job(photos, images, used, masks, options, work, sequence=video)
     seconds["preparing"] = time.monotonic() - started
     result = process.run(job, source, tell)
     left_out |= result.pop("left_out")
-    notes = {name: "blurred: it has much less fine detail than the others" for name in blurred(photos)}
+    notes = {name: "blurred: it has much less fine detail than the others" for name in sfm_photos.blurred(photos)}
     notes |= {photo.name: f"focal length in EXIF not used: {photo.exif.doubt}" for photo in photos if photo.exif.doubt}
     seconds |= result.pop("seconds")
     seconds["all"] = time.monotonic() - begun
@@ -183,7 +182,7 @@ def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str],
     decided = {}
     for key, alike in groups.items():
         told = [photo for photo in alike if photo.panorama]
-        closed = len(alike) >= LEAST and statistics.median(photo.seam for photo in alike) > ALIKE
+        closed = len(alike) >= LEAST and statistics.median(photo.seam for photo in alike) > sfm_photos.ALIKE
         decided[key] = model == SPHERICAL_MODEL or (
             model == "auto" and (closed or len(told) >= TELLING * len(alike) > 0.0)
         )
@@ -229,7 +228,7 @@ def make_job(
         (links / plain[photo.name]).symlink_to((images / used[photo.name]).resolve())
     for photo in photos:
         if photo.name in masks:
-            mask = colmap_mask(masks[photo.name], photo.name, (photo.width, photo.height))
+            mask = colmap_mask(masks[photo.name], (photo.width, photo.height))
             mask.save(mask_files / f"{plain[photo.name]}.png")
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
     cameras = [camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)]
@@ -285,7 +284,7 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         write_model(model, sparse)
         write_frame(result, frame)
         write_report(result, values, model)
-        write_file(result / "poses.json", json.dumps({"made": images == work / IMAGES, **kept}).encode())
+        write_file(result / "poses.json", json.dumps({"made": images == work / sfm_photos.IMAGES, **kept}).encode())
     process.delete_work(work, "links", "masks", MODEL)
     found = _finished(work, images)
     assert found is not None

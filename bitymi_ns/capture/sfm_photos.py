@@ -20,6 +20,7 @@ from bitymi_ns.capture.folder_contents import open_picture, photographs_below
 from bitymi_ns.capture.image_files import eight_bits, in_srgb
 from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.types import CaptureError, is_full_sphere
+from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.safe_reading import open_regular, why
 from bitymi_ns.trust import is_text
@@ -28,6 +29,8 @@ PLAIN = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "BMP": (".bmp",), "TIFF": (".tif", ".tiff"),
 }  # fmt: skip
 """Formats and extensions that COLMAP and nerfstudio read."""
+JPEG_QUALITY = 97
+IMAGES = "images"  # subfolder of the work folder for upright copies, or a video's frames
 COPY = ".jpg"  # appended to a photograph's name for its upright copy
 THUMB = 256  # longer side of grey thumbnails for duplicate detection, pixels
 SHARPNESS_SIZE = 1024  # longer side for measuring sharpness, pixels
@@ -183,6 +186,32 @@ def upright(photo: Photo) -> Image.Image:
         picture = in_srgb(ImageOps.exif_transpose(eight_bits(image))).convert("RGB")
     picture.info["exif"] = exposure.tobytes()
     return picture
+
+
+def upright_photos(
+    photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
+) -> tuple[Path, dict[str, str]]:
+    """Write upright JPEG copies of the photographs that need one. Return the folder to read (`folder` itself if none
+    does, else `images` in the work folder, with links to the others), and the names in it by photograph."""
+    if all(photo.plain for photo in photos):
+        return folder, {photo.name: photo.name for photo in photos}
+    names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}
+    target = work / IMAGES
+    if not target.is_dir():
+        with complete_folder(target) as new:
+            for i, photo in enumerate(photos):
+                progress("turning photographs upright", i, len(photos))
+                path = new / names[photo.name]
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if photo.plain:
+                    there = os.path.realpath(target / names[photo.name])
+                    # relative, so that both folders may be moved together
+                    path.symlink_to(os.path.relpath(photo.path.resolve(), os.path.dirname(there)))
+                else:
+                    picture = upright(photo)
+                    picture.save(path, quality=JPEG_QUALITY, subsampling=0, exif=picture.info["exif"])
+            progress("turning photographs upright", len(photos), len(photos))
+    return target, names
 
 
 def blurred(photos: Sequence[Photo]) -> list[str]:

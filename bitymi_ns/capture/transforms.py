@@ -12,15 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bitymi_ns.capture.find_files import (
-    FileFinder,
-    downscaled,
-    find_maps,
-    find_masks,
-    find_photographs,
-    folded,
-    report_files,
-)
+from bitymi_ns.capture import find_files
 from bitymi_ns.capture.image_files import image_size
 from bitymi_ns.capture.lens import colmap_distortion
 from bitymi_ns.capture.masks import with_masks
@@ -93,18 +85,18 @@ def read_transforms(
                 )
     lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
     names = [frame["file_path"] for frame in frames]
-    files = find_photographs(path, names, need_photos)
-    masks = find_masks(path.parent, [frame.get("mask_path") if use_masks else None for frame in frames], files,
-                        need_photos)  # fmt: skip
-    maps = find_maps(path, frames, need_photos)
+    files = find_files.find_photographs(path, names, need_photos)
+    masked = [frame.get("mask_path") if use_masks else None for frame in frames]
+    masks = find_files.find_masks(path.parent, masked, files, need_photos)
+    maps = find_files.find_maps(path, frames, need_photos)
     cloud = meta.get("ply_file_path")
     if cloud is not None and (not isinstance(cloud, str) or not cloud):
         fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it or remove it.")
     if cloud and not os.path.isfile(path.parent / cloud):
-        there = FileFinder(path.parent, extensions=(".ply",)).find(cloud)
+        there = find_files.FileFinder(path.parent, extensions=(".ply",)).find(cloud)
         meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
     if need_photos:
-        report_files(path, names, files, masks)
+        find_files.report_files(path, names, files, masks)
     known = {*USED, *IRRELEVANT} - ({"aabb_scale"} if own_format else set())
     unused = [key for key in meta if key not in known]
     unused += [f"{key} of frames" for key in dict.fromkeys(k for f in frames for k in f) if key not in known]
@@ -124,7 +116,7 @@ def read_transforms(
         photographs = with_masks(photographs, path.parent, base, masks_path, downscale)
     used = [*files, *(each.mask for each in photographs), *(file for each in maps for file in astuple(each))]
     if downscale > 1:
-        photographs = downscaled(photographs, path.parent, downscale)
+        photographs = find_files.downscaled(photographs, path.parent, downscale)
     named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
     return Transforms(path, meta, photographs, NameLists(lists), named)
 
@@ -176,7 +168,10 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
             fail(f"{path}: frame {i} (counted from 0) has no {' and no '.join(lacking)}. Add that or remove the frame.")
         for key in FILE_KEYS:
             name = frame.get(key, "none")
-            if not isinstance(name, str) or folded(name)[-1:] in ((), ("..",)):  # of the folder itself or above
+            if not isinstance(name, str) or find_files.folded(name)[-1:] in (
+                (),
+                ("..",),
+            ):  # of the folder itself or above
                 fail(f"{path}: the {key} of frame {i} is {name!r}, not the name of a file")
             if key in frame and os.sep == "/" and not os.path.exists(path.parent / name):
                 frame[key] = name.replace("\\", "/")

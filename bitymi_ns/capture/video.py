@@ -13,8 +13,7 @@ import numpy.typing as npt
 from PIL import Image, ImageOps
 
 from bitymi_ns.capture.cache import content_key, made_once
-from bitymi_ns.capture.prepare import IMAGES, JPEG_QUALITY
-from bitymi_ns.capture.sfm_photos import sharpness
+from bitymi_ns.capture.sfm_photos import IMAGES, JPEG_QUALITY, sharpness
 from bitymi_ns.capture.types import CaptureError, warn
 from bitymi_ns.files import Tell, complete_folder
 from bitymi_ns.progress import Progress

@@ -10,8 +10,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from bitymi_ns.capture.exif import Exif, exposure_settings, focal_length, read_exif
 from bitymi_ns.capture.image_files import exposure_stops
-from bitymi_ns.capture.prepare import upright_photos
-from bitymi_ns.capture.sfm_photos import read_photo
+from bitymi_ns.capture.sfm_photos import read_photo, upright_photos
 from bitymi_ns.progress import no_progress
 
 B = ExifTags.Base

@@ -263,7 +263,7 @@ def test_masks_that_fit_no_photograph_are_refused(copied: Copy) -> None:
     with pytest.raises(CaptureError, match="no mask in .* belongs to a photograph"):
         find_poses(folder)
     Image.new("L", (216, 288)).save(folder / "masks" / "photo_1.png")
-    with pytest.raises(CaptureError, match="216 x 288 pixels, its photograph photo_1.png"):
+    with pytest.raises(CaptureError, match="photo_1.png is turned by a quarter: it has 216 x 288 pixels"):
         find_poses(folder)
 
 

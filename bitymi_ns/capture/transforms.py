@@ -28,8 +28,11 @@ HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind
 INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy")
 LISTS = {f"{split}_filenames": split for split in ("train", "val", "test")}  # of names of photographs
 FILE_KEYS = ("file_path", "mask_path", "depth_file_path", "normal_file_path")
-LATLONG = ("latlong", "is_latlong")
-"""instant-ngp's entries for 360-degree pictures with latitude and longitude along their sides."""
+MODELS = {
+    **dict.fromkeys(("latlong", "is_latlong"), "EQUIRECTANGULAR"),
+    **dict.fromkeys(("is_fisheye", "fisheye"), "OPENCV_FISHEYE"),
+}
+"""instant-ngp's entries for camera models; latlong: with latitude and longitude along the pictures' sides."""
 CAMERA_TYPES = {
     **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "PERSPECTIVE"),
     "OPENCV_FISHEYE": "FISHEYE", "EQUIRECTANGULAR": "EQUIRECTANGULAR", "FISHEYE624": "FISHEYE624",
@@ -45,8 +48,8 @@ FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_
 OF_MATRIX = {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # rows and columns of a camera matrix
 EQUAL_AREA = ("equirectangular", "is_equirectangular")  # instant-ngp's entries for 360-degree rows of equal areas
 USED = {
-    "frames", *FILE_KEYS, "transform_matrix", "camera_model", "is_fisheye", "fisheye", "ply_file_path",
-    *LATLONG, *EQUAL_AREA, "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
+    "frames", *FILE_KEYS, "transform_matrix", "camera_model", "ply_file_path",
+    *MODELS, *EQUAL_AREA, "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
     *INTRINSICS, *DISTORTION, *FOCALS["x"], *FOCALS["y"],
 }  # fmt: skip
 IRRELEVANT = {"rotation", "sharpness", "colmap_im_id", "made_by"}  # unused entries that are not reported
@@ -76,13 +79,6 @@ def read_transforms(
     masks, see `with_masks`. Raises CaptureError: the file cannot be used, or lacks photographs that are needed."""
     meta = load_transforms(path, own_format)
     frames = meta["frames"]
-    for holder in (meta, *frames):
-        for key in EQUAL_AREA:
-            if holder.get(key) and "camera_model" not in holder:
-                fail(
-                    f"{path}: {key} is set, by which instant-ngp means pictures whose rows show equal areas, which "
-                    'cannot be read. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.'
-                )
     lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
     names = [frame["file_path"] for frame in frames]
     files = find_files.find_photographs(path, names, need_photos)
@@ -131,9 +127,7 @@ def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
         _drop_nulls(meta)
         _check_frames(path, meta, own_format)
         for holder in (meta, *meta["frames"]):
-            matrix = holder.pop("intrinsic_matrix", None)  # of NeuS2
-            for key, (i, j) in OF_MATRIX.items() if matrix else ():
-                holder.setdefault(key, matrix[i][j])
+            _translate(path, holder)
         _check_applied(path, meta)
         for key in [key for key in LISTS if key in meta]:
             if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
@@ -149,6 +143,24 @@ def _drop_nulls(meta: Any) -> None:
         for key, value in list(holder.items()) if isinstance(holder, dict) else ():
             if value is None or (value == "" and key in FILE_KEYS[1:]):
                 del holder[key]
+
+
+def _translate(path: Path, holder: dict[str, Any]) -> None:
+    """Write camera entries of instant-ngp and NeuS2, of a frame or of all, as nerfstudio's."""
+    matrix = holder.pop("intrinsic_matrix", None)
+    for key, (i, j) in OF_MATRIX.items() if matrix else ():
+        holder.setdefault(key, matrix[i][j])
+    if "camera_model" in holder:
+        return
+    for key in EQUAL_AREA:
+        if holder.get(key):
+            fail(
+                f"{path}: {key} is set, by which instant-ngp means pictures whose rows show equal areas, which cannot "
+                'be read. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.'
+            )
+    stated = [model if holder[key] else "OPENCV" for key, model in MODELS.items() if key in holder]
+    if stated:
+        holder["camera_model"] = min(stated, key="OPENCV".__eq__)
 
 
 def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
@@ -179,23 +191,6 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
     if 0 < len(without) < len(frames):
         advice = "Give every frame a mask (a white picture lets all pixels count), or none."
         fail(f"{path}: no mask_path for {listed(without)}, but other frames have one. {advice}")
-
-
-def is_equirectangular(meta: dict[str, Any], frame: dict[str, Any]) -> bool:
-    """Test for a 360-degree picture, which has no focal length."""
-    return stated_model(meta, frame) == "EQUIRECTANGULAR"
-
-
-def stated_model(meta: dict[str, Any], frame: dict[str, Any]) -> Any:
-    """Return nerfstudio's name of a frame's camera model; entries of the frame go before those of the file."""
-    for holder in (frame, meta):
-        if "camera_model" in holder:
-            return holder["camera_model"]
-        if any(holder.get(key) for key in LATLONG):
-            return "EQUIRECTANGULAR"
-        if any(key in holder for key in ("is_fisheye", "fisheye")):
-            return "OPENCV_FISHEYE" if holder.get("is_fisheye") or holder.get("fisheye") else "OPENCV"
-    return "OPENCV"
 
 
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
@@ -245,7 +240,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
             width, height = width or size[0], height or size[1]
         else:  # reported when it is read; without photographs any size serves
             width, height = width or height or UNKNOWN_SIZE, height or width or UNKNOWN_SIZE
-    if is_equirectangular(meta, frame):
+    if frame.get("camera_model", meta.get("camera_model")) == "EQUIRECTANGULAR":
         middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
         if max(abs(middle[0] - width / 2.0), abs(middle[1] - height / 2.0)) > 1.0:
             fail(
@@ -282,7 +277,7 @@ def _focal_length(path: Path, key: str, value: float, side: float) -> float:
 def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
     """Convert camera model and distortion of a frame; see `colmap_distortion`."""
     label = f"of {frame['file_path']}"
-    model = stated_model(meta, frame)
+    model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))
     if not isinstance(model, str) or model not in CAMERA_TYPES:
         advice = f"nerfstudio knows {', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
         fail(f"{path}: the camera_model {model!r} {label} is unknown. {advice}")

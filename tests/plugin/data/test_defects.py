@@ -340,6 +340,7 @@ DEFECTS: list[tuple[Callable[[Path], Path], str, Change, str]] = [
     (nerfstudio, "", lambda path: path.write_text(f"{path.read_text().rstrip()[:-1]},}}"), NOT_JSON),
     (instant_ngp, "", entries(equirectangular=True),
      'equirectangular is set, .*rows show equal areas.* write "camera_model": "EQUIRECTANGULAR"'),
+    (instant_ngp, "", entries(latlong=True, is_fisheye=False), "EQUIRECTANGULAR, but .*: pictures of all .* are twice"),
     (instant_ngp, "", two_files, "frame 2 is of images/frame_00003, but there are .*3.png, images/.*webp"),
     (instant_ngp, "", frame(2, file_path="images/frame_3"), r"(?s)1 of 12 .* missing:\s+\S*images/frame_3\s+Copy"),
     *((instant_ngp, "", partial(box_of_ngp, value=value), "transforms.json: aabb_scale")
@@ -382,6 +383,7 @@ SAME: list[tuple[Callable[[Path], Path], str, Change, str]] = [
     (nerfstudio, "", camera_matrices, ""),
     (nerfstudio, "", matrices(lambda pose: pose[:3]), ""),
     (nerfstudio, "", matrices(lambda pose: pose / 8), "is divided by its last number, which is not 1"),
+    (instant_ngp, "", entries(latlong=False, is_fisheye=False), ""),
     (instant_ngp, "", scaled(0.4), "scaled by 0.4"),
     (blender, "", scaled(2.5), "scaled by 2.5"),
     (blender, "", two_endings, ""),

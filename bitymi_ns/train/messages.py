@@ -10,6 +10,7 @@ from typing import Any
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 from bitymi_ns.train.init import PointReport, default_table_size, table_size_of
+from bitymi_ns.train.memory import SHARE
 from bitymi_ns.train.schedules import Schedule
 
 
@@ -63,6 +64,14 @@ def held_back(count: int, most: int, config: TrainConfig) -> str:
         f"Densification stops at {most:,} surfels, one for {densify.pixels_per_surfel:g} pixels of all photographs or "
         f"{densify.growth:g} times the first, and would have made {count:,} more now (--max-surfels, "
         "--pipeline.model.train.densify.pixels-per-surfel, growth)."
+    )
+
+
+def memory_reached(what: str, most: int) -> str:
+    """Report that memory has stopped the growth of `what` ("Surfels") at a number of them."""
+    return (
+        f"{what} stop growing at {most:,}, as {SHARE:.0%} of the memory is used up; the run goes on. To have more of "
+        "them, end other programs or train smaller photographs (--pipeline.datamanager.longest-side)."
     )
 
 

@@ -46,7 +46,7 @@ class Schedule:
         self.max_steps = max_steps
         self.extent = float(extent)
         check_ranges(config)
-        self._texels, self._pixels = texels, pixels
+        self._texels, self.pixels = texels, pixels
         self.plan()
 
     def plan(self, begun: int | None = None) -> None:
@@ -67,7 +67,7 @@ class Schedule:
         prunes = densify.prune_error > 0 and 0 < stop < REFERENCE_STEPS
         self.error_prune_steps = self._events([stop] if prunes else [], self.texels_start)
         self.final_prune_steps = self._events([s for s in densify.final_prune_steps if 0 < s <= REFERENCE_STEPS])
-        self._doublings = [] if begun is not None else self._image_doublings(self._pixels)
+        self._doublings = [] if begun is not None else self._image_doublings(self.pixels)
         self._last_part: Schedule | None = None
         if self.texels_start < self.max_steps:
             slower = config.lr.times(config.texels.surfel_rates)

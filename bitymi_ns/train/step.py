@@ -20,6 +20,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
 from bitymi_ns.train.losses import fused_losses, objective
+from bitymi_ns.train.messages import memory_reached
 from bitymi_ns.train.optimizers import ResizeHook, set_rate
 from bitymi_ns.train.poses import Poses
 from bitymi_ns.train.processes import ALONE, Processes
@@ -129,6 +130,7 @@ class Training:
         self.exposure = Exposure(config.exposure, data.exif_stops, data.files)
         cameras = [view.camera for view in data.views] if data.cameras is None else data.cameras
         self.poses = Poses(self.schedule, cameras)
+        self.announce = announce
         self.guard = RollbackGuard(scene, optimizers, self.strategy, self.exposure, self.poses, announce)
         self.texels = LearningTexels(scene, self.schedule, processes)
         self.watch = LossWatch()
@@ -172,6 +174,8 @@ class Training:
         began = self.texels.begin(step, self.views)
         if began:
             self.guard.restart()
+            if self.texels.most_by_memory:
+                self.announce(memory_reached("Texels", self.texels.most_by_memory))
         if began or grows:
             give_back_memory()
         self.guard.before(step, self.views)
@@ -236,6 +240,8 @@ class Training:
             report = self.guard.failed(step, error)
         else:
             report |= self.guard.after(step, loss, broken)
+        if "most_by_memory" in report:
+            self.announce(memory_reached("Surfels", self.strategy.most))
         if report:
             self.step_sizes.measure(self.scene)
         if "rolled_back" in report:
@@ -252,6 +258,12 @@ class Training:
         self.processes.maximum(most)
         return loss / self.processes.views, most
 
+    @property
+    def by_memory(self) -> dict[str, int]:
+        """Numbers at which memory has stopped surfels and texels; without those that it has not."""
+        bounds = {"surfels": self.strategy.most_by_memory, "texels": self.texels.most_by_memory}
+        return {f"{what}_by_memory": most for what, most in bounds.items() if most}
+
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the run, without the scene and its optimisers."""
         return {
@@ -263,6 +275,7 @@ class Training:
             "seconds": self.clock.seconds,
             "cpu_seconds": self.clock.cpu_seconds,
             "max_steps": self.schedule.max_steps,
+            "texels_by_memory": self.texels.most_by_memory,
             "texels_start": self.schedule.texels_start if isinstance(self.scene.field, TexelField) else None,
         }
 
@@ -275,6 +288,7 @@ class Training:
             earlier = Schedule(schedule.config, length, texels=True).texels_start
             schedule.plan(earlier if begun is None else int(begun))
         self.strategy.load_state_dict(state["strategy"])
+        self.texels.most_by_memory = int(state.get("texels_by_memory", 0))
         if "guard" in state:
             self.guard.load_state_dict(state["guard"])
             if length != schedule.max_steps:

@@ -29,10 +29,12 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.init import tangents
+from bitymi_ns.train.memory import PER_SURFEL, PER_TEXEL, room_to_grow, view_bytes
 from bitymi_ns.train.optimizers import ResizeHook, cap_opacity, replace_rows
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.score import multi_view_scores, removal_errors
+from bitymi_ns.train.texels import SMALLEST
 from bitymi_ns.train.views import View
 
 if TYPE_CHECKING:
@@ -58,6 +60,8 @@ class Strategy:
             the projected centre, NDC; the same for the absolute gradient (AbsGS); number of views in which the surfel
             was visible; largest half extent on screen, pixels.
         generator: CPU generator of all random choices.
+        most: number of surfels at which densification stops; 0: no limit.
+        most_by_memory: the same number, if memory has set it; else 0.
     """
 
     def __init__(
@@ -79,21 +83,24 @@ class Strategy:
         self.processes = processes
         self.schedule = schedule
         self.on_resize = on_resize
-        self.most = most_surfels(self.config, image_pixels, first_surfels)
+        self.most = self._most = most_surfels(self.config, image_pixels, first_surfels)
+        self.most_by_memory = 0
         # opacity below which a surfel may be replaced: fainter than at the start, and faint enough for a final prune
         self._replaceable = min(self.config.densify.final_prune_opacity, 0.5 * self.config.init_opacity)
         self.generator = torch.Generator().manual_seed(self.config.seed)
         self.statistics = torch.zeros(len(STATISTICS), 0)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Return the statistics and the state of the generator."""
+    def state_dict(self) -> dict[str, Any]:
+        """Return the statistics, the state of the generator, and the number at which memory stops densification."""
         rows = zip(STATISTICS, self.statistics.clone(), strict=True)
-        return {**dict(rows), "generator": self.generator.get_state()}
+        return {**dict(rows), "generator": self.generator.get_state(), "most_by_memory": self.most_by_memory}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.statistics = torch.stack([state[name].detach().float() for name in STATISTICS])
         self.generator.set_state(state["generator"].cpu().to(torch.uint8))
+        self.most_by_memory = int(state.get("most_by_memory", 0))  # checkpoints of earlier versions have none
+        self.most = self.most_by_memory or self._most
 
     def accumulate(self, *projections: Projection) -> None:
         """Add the statistics of a step's training views, over all processes; call it after the backward passes."""
@@ -184,8 +191,10 @@ class Strategy:
         clone = wanted & ~large & (grad_sum / seen >= config.grad_threshold)
         split = wanted & large & (abs_grad_sum / seen >= config.abs_grad_threshold)
         replaced = torch.zeros_like(clone)
+        count = int((clone | split).sum())
+        report |= self._heed_memory(step, n, count, device)
         if self.most > 0:
-            count, room = int((clone | split).sum()), max(0, self.most - n)
+            room = max(0, self.most - n)
             gradient = abs_grad_sum / seen
             if config.max_surfels > 0:
                 room //= sum(step <= later for later in self.schedule.densify_steps)
@@ -224,6 +233,17 @@ class Strategy:
         self.statistics = torch.zeros(len(STATISTICS), len(scene), device=device)
         cap_opacity(surfels, optimizers, config.opacity_clamp)
         return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
+
+    def _heed_memory(self, step: int, n: int, wanted: int, device: torch.device) -> dict[str, float]:
+        """End growth for the rest of the run if `wanted` more surfels than n, with their smallest tiles, might not fit
+        beside a view at full size."""
+        to_come = (1.0 - self.schedule.resolution_factor(step) ** 2) * view_bytes(self.schedule.pixels)
+        each = PER_SURFEL + PER_TEXEL * SMALLEST**2
+        fitting = n + max(0, int((room_to_grow(device, self.processes) - to_come) / each))
+        if fitting >= n + wanted or 0 < self.most <= fitting:
+            return {}
+        self.most = self.most_by_memory = fitting
+        return {"most_by_memory": fitting}
 
     def _halves(self, surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
         """Split surfels into two halves along their long axes, which together look about like the surfel."""

@@ -23,6 +23,7 @@ from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_project
 from bitymi_ns.scene.visibility import Visibility, visibility
 from bitymi_ns.train.init import tangents
 from bitymi_ns.train.losses import count_values
+from bitymi_ns.train.memory import PER_TEXEL, PER_TEXEL_SUM, room_to_grow
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import OnDemand, at_size
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from bitymi_ns.train.views import DownscaledViews, View
 
 SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
-FEW = 1 << 23  # total number of texels that runs of any length may have: 235 MB
+FEW = 1 << 23  # total number of texels that runs of any length may have: 370 MB
 FEWER = 0.8  # factor on the texels per tile, repeated until the total is below the limit
 LEAST_SHARE = 0.25
 """Lower bound of a texel's coverage if only a sample of the views is measured, as a share of the coverage in one view.
@@ -49,6 +50,7 @@ class LearningTexels:
         self.scene, self.schedule, self.options, self.processes = scene, schedule, schedule.config.texels, processes
         self._rates: list[RemovableHandle] = []
         self._views = 1
+        self.most_by_memory = 0  # number of texels to which memory has limited the tiles; 0: it has not
 
     def begin(self, step: int, views: DownscaledViews) -> bool:
         """Create the tiles on the first step of the texel stage; True on that step."""
@@ -57,14 +59,18 @@ class LearningTexels:
             return False
         sample = spread(len(views), self.schedule.survey_views)
         sampled = OnDemand(len(sample), lambda i: views.at(sample[i], 1.0))
-        field = None
+        device = self.scene.surfels["means"].device
+        of_texel = PER_TEXEL + PER_TEXEL_SUM * (device.type == "cuda")
+        fitting = max(0, int(room_to_grow(device, self.processes) / of_texel))
+        field, found = None, None
         if self.processes.first:
-            field = blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come)
+            field, bound = _blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come, fitting)
+            found = {**field.state_dict(), "bound": bound}
         if self.processes.count > 1:
-            device = self.scene.surfels["means"].device
-            found = self.processes.from_first(None if field is None else field.state_dict(), device)
+            found = self.processes.from_first(found, device)
             field = TexelField(found["size"], found["extent"], found["texels"], found["share"], found.get("alpha"))
         self.scene.field = field
+        self.most_by_memory = len(field.texels) if found["bound"] else 0
         return True
 
     @property
@@ -132,7 +138,6 @@ class LearningTexels:
                     values.clamp_(0.0, ALPHA_LIMIT)
 
 
-@torch.no_grad()
 def blank_texels(
     scene: Scene, views: Sequence[View], count: int, options: TexelConfig, to_come: float = math.inf
 ) -> TexelField:
@@ -141,6 +146,20 @@ def blank_texels(
     A surfel without fragments that may have a residual gets one texel. `views`: sample of the training views at full
     size; only cameras and masks are used. `count`: number of all training views. `to_come`: number of renders in the
     texel stage."""
+    return _blank_texels(scene, views, count, options, to_come)[0]
+
+
+@torch.no_grad()
+def _blank_texels(
+    scene: Scene,
+    views: Sequence[View],
+    count: int,
+    options: TexelConfig,
+    to_come: float,
+    fitting: float = math.inf,
+) -> tuple[TexelField, bool]:
+    """Do the work of `blank_texels`, with at most `fitting` texels as far as the smallest tiles allow; True: that is
+    fewer than there would be."""
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound
@@ -149,6 +168,8 @@ def blank_texels(
     seen = visibility(surfels, smaller, scene.near, bound)
     seen = replace(seen, pixels=seen.pixels / scale**2)
     size, extent = tiles_as_seen(surfels, cameras, seen, scene.near, bound, options, to_come)
+    wanted = int(size.long().prod(1).sum())
+    size = bounded(size, seen.pixels / options.pixels_per_texel, fitting)
     field = TexelField(size, extent, extent.new_zeros(int(size.long().prod(1).sum()), 3))
     small = OnDemand(len(views), lambda i: at_size(views[i], smaller[i], extent.device))
     seen_in_all = coverage(scene, field, small) * (count / max(1, len(views)) / scale**2)
@@ -158,7 +179,7 @@ def blank_texels(
     field.share.copy_(1.0 / (seen_in_all + options.prior))
     if options.alpha_rate > 0:
         field.alpha = Parameter(torch.ones_like(field.share))
-    return field
+    return field, len(field.texels) < wanted
 
 
 def most_texels(options: TexelConfig, rendered: float) -> float:
@@ -220,12 +241,18 @@ def tiles_as_seen(
     size = seen_sides(tile_pixels(surfels, cameras, extent, near), SMALLEST, options.largest)
     texels = seen.pixels / options.pixels_per_texel
     most = most_texels(options, to_come * mean_pixels(cameras))
-    size = coarsened(size, texels, SMALLEST)
+    size = bounded(coarsened(size, texels, SMALLEST), texels, most)
+    size[extent <= 0] = 1
+    return size, torch.where(extent > 0, extent, torch.full_like(extent, SUPPORT))
+
+
+def bounded(size: Tensor, texels: Tensor, most: float) -> Tensor:
+    """Coarsen tiles of `size` [N, 2] and at most `texels` [N] texels each until there are at most `most` in all, or all
+    are of the smallest size."""
     while int(size.long().prod(1).sum()) > most and int(size.max()) > SMALLEST:
         texels = FEWER * texels
         size = coarsened(size, texels, SMALLEST)
-    size[extent <= 0] = 1
-    return size, torch.where(extent > 0, extent, torch.full_like(extent, SUPPORT))
+    return size
 
 
 @torch.no_grad()

@@ -14,7 +14,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.callbacks import FILE
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from bitymi_ns.train import init
+from bitymi_ns.train import init, strategy, texels
 from tests.captures import edit, write_cloud
 from tests.e2e.runs import Start, checkpoint, config_of
 
@@ -47,6 +47,28 @@ def test_a_run_starts_with_as_many_surfels_as_its_steps_can_place(
     ns_train.main(resumed)  # which densification may double as before, however many points there are
     for of in ((config, 4), (resumed, 7)):
         assert checkpoint(*of)["pipeline"]["_model._extra_state"]["first_surfels"] == 10
+
+
+def test_a_run_that_memory_ends_says_so_in_curve_and_checkpoint(
+    start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(strategy, "room_to_grow", lambda device, processes: 2e5)
+    monkeypatch.setattr(texels, "room_to_grow", lambda device, processes: 0.0)
+    config = start()
+    ns_train.main(config)
+    said = " ".join(capsys.readouterr().out.split())
+    points = [json.loads(line) for line in (config.get_base_dir() / FILE).read_text().splitlines()]
+    most = points[0]["surfels_by_memory"]
+    assert said.count(f"Surfels stop growing at {most:,}, as 75% of the memory is used up") == 1
+    assert said.count("Texels stop growing at ") == 1 and "Densification stops" not in said
+    assert all(point["surfels"] <= most == point["surfels_by_memory"] for point in points)
+    assert "texels_by_memory" not in points[0]
+    extra = checkpoint(config, 59)["pipeline"]["_model._extra_state"]["run"]
+    assert extra["strategy"]["most_by_memory"] == most
+    resumed = start(name="resumed")
+    resumed.load_dir, resumed.max_num_iterations = config.get_checkpoint_dir(), 70
+    ns_train.main(resumed)
+    assert checkpoint(resumed, 69)["pipeline"]["_model._extra_state"]["run"]["strategy"]["most_by_memory"] == most
 
 
 @pytest.mark.parametrize(
@@ -108,7 +130,7 @@ def test_points_that_are_nan_are_left_out_and_counted(
     ns_train.main(config)
     out = " ".join(capsys.readouterr().out.split())
     assert "5 of 200 points" in out
-    assert "Training will take about" in out and "GB of memory for 10 training photographs of 48 x 36" in out
+    assert "Training will take" in out and "GB of memory for 10 training photographs of 48 x 36" in out
     write_cloud(spoiled / "sparse_pc.ply", np.full((200, 3), np.nan))
     with pytest.raises(InputError, match="all 200 points .* are NaN"):
         ns_train.main(start(data=spoiled, name="nan"))

@@ -29,7 +29,7 @@ from bitymi_ns.scene.visibility import views_without_surfels
 from bitymi_ns.train import messages
 from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
-from bitymi_ns.train.forecast import Forecast, expected_surfels
+from bitymi_ns.train.forecast import Forecast, Steps, expected_surfels
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
@@ -90,22 +90,24 @@ class TrainingRun:
             self._check_start()
         learns = scene.config.texture == "texels"
         texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
-        most = self.training.strategy.most
-        lists = self.training.schedule.lists_fragments(self.datamanager.train_dataset.has_maps)
+        pixels, schedule = [camera.width * camera.height for camera in cameras], self.training.schedule
+        surfels = expected_surfels(
+            schedule, metadata["first_surfels"], sum(pixels) / len(pixels), self.training.strategy.most
+        )
+        lists = schedule.lists_fragments(self.datamanager.train_dataset.has_maps)
+        most = max(len(scene), int(surfels[self.first_step :].max(initial=0)))
         state_training(scene, cameras, most, texels, to_come, trainer.world_size, lists)
-        self.forecast = self._forecast([camera.width * camera.height for camera in cameras])
+        self.forecast = self._forecast(pixels, surfels)
         self._longest_side = max(max(camera.width, camera.height) for camera in cameras)
         self.datamanager.step_view = self.training.view
 
-    def _forecast(self, pixels: Sequence[int]) -> Forecast:
-        """Prepare the estimate of the run's end, from the pixels of its training views."""
-        mean, schedule, held_out = sum(pixels) / len(pixels), self.training.schedule, len(self.datamanager.eval_dataset)
-        first, most = self.datamanager.train_dataset.metadata["first_surfels"], self.training.strategy.most
-        surfels = expected_surfels(schedule, first, mean, most)
+    def _forecast(self, pixels: Sequence[int], surfels: Steps) -> Forecast:
+        """Prepare the estimate of the run's end, from pixels of its training views and surfels of its steps."""
+        held_out = len(self.datamanager.eval_dataset)
         at_once = min(held_out, self._curve_views or held_out)
         evaluated = {step: held_out if step + 1 >= self.total else at_once for step in self.curve_steps}
-        card = self.scene.surfels["means"].device.type == "cuda"
-        return Forecast(schedule, len(pixels), mean, surfels, evaluated, self.first_step, card)
+        card, mean = self.scene.surfels["means"].is_cuda, sum(pixels) / len(pixels)
+        return Forecast(self.training.schedule, len(pixels), mean, surfels, evaluated, self.first_step, card)
 
     def _say_end(self) -> None:
         """Say once, after the first steps, when the run will end, and what would halve its time."""
@@ -174,9 +176,9 @@ class TrainingRun:
             report = self.training.finish()
         except TrainingDiverged as error:
             self._diverged(error)
-        if report.get("held_back") and not self._held_back:
+        most = self.training.strategy.most
+        if report.get("held_back") and not self._held_back and not self.training.by_memory:
             self._held_back = True
-            most = self.training.strategy.most
             warn(messages.held_back(int(report["held_back"]), most, self.config))
         if report:
             writer.put_dict("Strategy", {k: torch.tensor(float(v)) for k, v in report.items()}, step)
@@ -204,7 +206,7 @@ class TrainingRun:
         quality = evaluate(self.scene, OnDemand(len(rows), lambda i: views[rows[i]]), self.config, poses, exposure)
         clock = self.training.clock
         times = {"seconds": round(clock.seconds, 4), "cpu_seconds": round(clock.cpu_seconds, 4)}
-        point = {"step": step + 1, **times, "surfels": len(self.scene)}
+        point = {"step": step + 1, **times, "surfels": len(self.scene), **self.training.by_memory}
         shown = ""
         if not math.isnan(quality.psnr):
             point |= {k: round(value, 4) for k, value in quality._asdict().items() if not math.isnan(value)}

@@ -249,6 +249,9 @@ def _check_run(run: Entry, rows: int, step: int) -> None:
         start.number(0, step)
         start.count()
     strategy = run["strategy"]
+    for most in (strategy.get("most_by_memory"), run.get("texels_by_memory")):
+        if most is not None:
+            most.count()
     first = strategy[STATISTICS[0]].tensor(None)
     if len(first) not in (0, rows):
         strategy[STATISTICS[0]].refuse(f"float32 [{rows}]")

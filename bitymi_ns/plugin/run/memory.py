@@ -22,13 +22,18 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TexelConfig
+from bitymi_ns.train.forecast import KEPT
+from bitymi_ns.train.memory import PER_FRAGMENT, PER_PIXEL, PER_SURFEL, PER_TEXEL, PER_TEXEL_SUM, SHARE
 from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget
 
 COUNTED_VIEWS = 3  # views with counted fragments
 MARGIN = 1.1  # factor by which other views may have more fragments
 PROGRAM = 800e6  # bytes of Python, libraries, and a capture's cameras and points
-PER_FRAGMENT = 36  # bytes: list, gradients of weights and coordinates, order of the backward pass
+FREED = 500e6
+"""Bytes of freed blocks, each too small to be returned, that are kept for later views; less for small ones, which take
+`KEPT_LISTS` times their lists and pictures so."""
+KEPT_LISTS = 2
 PER_SHADED_FRAGMENT = 60
 """Further bytes with a hash-grid field: surfels and pixels of fragments, points, residuals and their gradients."""
 PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes on a card in lists of training
@@ -36,14 +41,11 @@ PER_PASSING_FRAGMENT = 36  # bytes on a card in temporary lists, for the coverag
 PER_BAKED_FRAGMENT = 48
 """Bytes on a card in the fine-tuning of an export: 28 of the list, 1 + 36 of the part that shows texels, at most 43 %
 as measured, and 3 of the pairs of surfel and tile, with about thirty fragments each."""
-PER_PIXEL = 400  # bytes: pictures, gradients and maps of a view, and the ten views of multi-view scores
-PER_SURFEL = 3000  # bytes in training: parameters, gradients, Adam's averages, and two states to go back to
-PER_TEXEL = 28  # bytes in training: texel, its motion, and two states in half precision to go back to
-PER_TEXEL_SUM = 16  # bytes more on a card: the gradient, which the CPU adds tile by tile
 PER_BAKED_TEXEL = 96  # bytes in an export: eight copies, as learned, listed, tuned, and in pages
 PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
 """Bytes of a view that the fine-tuning keeps; 22 to 43 % of the fragments show a texel."""
-VIEWS_OF_TEXELS = 12  # views' worth of texels beside the smallest tiles; 3.5 to 11 were measured
+VIEWS_OF_TEXELS = 7  # views' worth of texels; 3.7 to 15 were measured
+SPREAD = 1.3  # factor of the stated figures to either side of the estimate
 
 
 @torch.no_grad()
@@ -63,7 +65,7 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
 def state_training(
     scene: Scene,
     cameras: Sequence[Camera],
-    most_surfels: int,
+    most_surfels: float,
     texels: TexelConfig | None = None,
     to_come: int = 0,
     processes: int = 1,
@@ -74,7 +76,7 @@ def state_training(
     Args:
         scene: at the start.
         cameras: of the training views, on the CPU.
-        most_surfels: largest number of surfels; 0 = no limit.
+        most_surfels: expected largest number of surfels.
         texels: options of texels that learn in training; None = none learn.
         to_come: number of renders from which texels learn.
         processes: of equal need on this machine.
@@ -87,22 +89,26 @@ def state_training(
         lists = lists or scene.config.max_fragments > 0 or not can_rasterize(device)
         kept = min(photograph_budget(device), 9 * total)
     else:
-        kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 6 * total)
-    needed = kept + PER_PIXEL * pixels
-    needed += _per_fragment(scene, PER_CARD_FRAGMENT if lists else PER_PASSING_FRAGMENT) * fragments
+        kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 3 * total)  # at half size
+    view = PER_PIXEL * pixels
+    view += _per_fragment(scene, PER_CARD_FRAGMENT if lists else PER_PASSING_FRAGMENT) * fragments
+    needed = kept + view + (0 if card else min(KEPT_LISTS * view, FREED))
     surfels = max(len(scene), most_surfels)
-    needed += PER_SURFEL * surfels
-    if texels is not None:
+    grown = PER_SURFEL * surfels
+    if texels is not None:  # they begin after the error prune
         most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
-        needed += (PER_TEXEL + card * PER_TEXEL_SUM) * (SMALLEST**2 * surfels + most)
-        needed += len(cameras) * surfels  # of `Visibility`, at most a byte for each surfel and view
+        most = max(most, SMALLEST**2 * KEPT * surfels)
+        grown = max(grown, KEPT * grown + (PER_TEXEL + card * PER_TEXEL_SUM) * most)
+        grown += len(cameras) * KEPT * surfels  # of `Visibility`, at most a byte for each surfel and view
+    needed += grown
     if card:  # a bound on fragments would bring lists, which take more memory
-        fewer = f"train fewer surfels (--max-surfels {max(1, surfels // 2)})"
+        fewer = f"train fewer surfels (--max-surfels {max(1, int(surfels / 2))})"
         advice = f"{fewer} or smaller photographs (--downscale-factor 2)"
     else:
         option = f"--pipeline.model.scene.max-fragments {max(1, fragments // 4)}"
         advice = f"draw large views in smaller parts, which takes longer: {option}"
-    _state("Training", needed if card else processes * needed, cameras, advice, device)
+    needed *= 1 if card else processes
+    _state("Training", (needed / SPREAD, needed * SPREAD), cameras, advice, device)
 
 
 def state_export(
@@ -132,7 +138,7 @@ def state_export(
     needed += max(seen, chosen, finetune_bytes + PER_SURFEL * learning)  # one after the other
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)
-    _state("The export", needed, cameras, "export with --finetune-memory 0, which takes longer", device)
+    _state("The export", (needed, needed), cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
 def _per_fragment(scene: Scene, of_card: float) -> float:
@@ -148,17 +154,24 @@ def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
     return max(sizes), sum(sizes)
 
 
-def _state(what: str, needed: float, cameras: Sequence[Camera], advice: str, device: torch.device) -> None:
-    """Print the need, and a warning if the machine or card has less."""
+def _state(
+    what: str, needed: tuple[float, float], cameras: Sequence[Camera], advice: str, device: torch.device
+) -> None:
+    """Print the need, from low to high, and a warning if the machine or card has less."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
     card = device.type == "cuda"
     memory, where = ("memory of the card", "the card") if card else ("memory", "this machine")
-    say(f"{what} will take about {needed / 1e9:.1f} GB of {memory} for {photographs}.")
+    (low, high), numbers = needed, "about {:.1f}"
+    if low < high:
+        numbers = "{:.2f} to {:.2f}"
+    say(f"{what} will take {numbers.format(low / 1e9, high / 1e9)} GB of {memory} for {photographs}.")
     # with the process's own, within its control group's limit
     of_machine = min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
     available = free_memory(device) if card else of_machine
-    if needed > available:
-        there = f"the {available / 1e9:.1f} GB that {where} has available"
+    there = f"the {available / 1e9:.1f} GB that {where} has available"
+    if low > available:
         warn(f"That is more than {there}. Close other programs, or {advice}.")
+    elif low < high and high > SHARE * available:
+        warn(f"Surfels and texels stop growing before they fill {there}.")

@@ -10,7 +10,7 @@ import numpy as np
 
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm import explain, pairs
-from bitymi_ns.capture.sfm.consistency import contradicted, drop_unlinked
+from bitymi_ns.capture.sfm.explain import contradicted, drop_unlinked
 from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
 from bitymi_ns.capture.types import CONTRADICTED
 

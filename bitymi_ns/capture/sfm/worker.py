@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap  # in this process with its signal handlers, which write the stack of a crash to the log
 
 from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.sfm import consistency, explain, mapping, pairs
+from bitymi_ns.capture.sfm import explain, mapping, pairs
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder, write_errors_as
 
@@ -69,7 +69,7 @@ def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, o
         "track_length": model.compute_mean_track_length(),
         "points": model.num_points3D(),
         "parallax_degrees": angle,
-        "contradicted": consistency.contradicted(model, database, job.pixel),
+        "contradicted": explain.contradicted(model, database, job.pixel),
         "pairs": len(graph.inliers),
         "left_out": explain.left_out(graph, placed, job.names),
     }

@@ -33,7 +33,7 @@ def test_the_end_is_known_from_the_first_steps_on(
     for step in range(steps):
         run.begin()
         view = 6e-7 * fragments * pixels * schedule.resolution_factor(step) ** 2 + 1.1e-6 * n
-        clock.now += view * (1.3 if schedule.texels_learn(step) else 1.0) + 1.5 * (step == 0)
+        clock.now += view * (1.5 if schedule.texels_learn(step) else 1.0) + 1.5 * (step == 0)
         if step in schedule.densify_steps:
             clock.now += 0.5 * 10 * view
             n = min(growth * n, 0.5 * pixels)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PILImage
@@ -97,12 +98,16 @@ def first_hits(room: Room, view: RoomView, pixels: NDArray[np.int64]) -> tuple[N
 def sparse_points(
     room: Room, views: list[RoomView], images: list[NDArray[np.uint8]], count: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Sample exact surface points [count, 3] and their pixels' colors [count, 3], evenly over all views."""
+    """Sample exact surface points [count, 3] and their pixels' colors [count, 3]: as many per view, more where it has
+    corners, as structure from motion finds them (by the root of a pixel's smaller eigenvalue)."""
     rng = np.random.default_rng([seed, 2])
     points, colors = [], []
     shares = np.diff(np.linspace(0, count, len(views) + 1).astype(int))
     for view, image, share in zip(views, images, shares, strict=True):
-        pixels = rng.choice(view.width * view.height, size=share, replace=share > view.width * view.height)
+        corners = cv2.cornerMinEigenVal(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 3).ravel().astype(float)
+        weights = np.sqrt(np.maximum(corners, 1e-3 * corners.max() + 1e-12))  # eigenvalues round below 0
+        replace = share > len(weights)
+        pixels = rng.choice(len(weights), size=share, replace=replace, p=weights / weights.sum())
         points.append(first_hits(room, view, pixels)[0])
         colors.append(image.reshape(-1, 3)[pixels])
     return np.concatenate(points), np.concatenate(colors)

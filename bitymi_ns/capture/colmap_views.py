@@ -11,13 +11,13 @@ import numpy as np
 
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
-from bitymi_ns.capture.find_files import FileFinder, renamed_message
+from bitymi_ns.capture.find_files import FileFinder, report_renamed
 from bitymi_ns.capture.folder_contents import images_of, photographs_below, photographs_in, result_in
 from bitymi_ns.capture.image_files import image_size, in_proportion
 from bitymi_ns.capture.masks import USUAL_FOLDERS
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.recognise import Found
-from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, SfmSettings, fail, say, warn
+from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, SfmSettings, fail, warn
 from bitymi_ns.trust import leads_inside, listed
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
@@ -136,17 +136,12 @@ def _find_folder(
     return best
 
 
-def _name_in(folder: Path, path: Path) -> str:
-    return path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name
-
-
 def warn_left_out(source: Source) -> set[Path]:
     """Report photographs that the model lacks or names differently; return the paths of all, in the model or not."""
     files = source.files()
-    other = renamed_message([image.name for image in source.model.images], files, source.image_folder)
-    if other:
-        say(f"The COLMAP model {source.folder}: {other}")
-    used = {_name_in(source.image_folder, path) for path in files}
+    stated, folder = [image.name for image in source.model.images], source.image_folder
+    report_renamed(f"The COLMAP model {source.folder}", stated, files, folder)
+    used = {path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name for path in files}
     nested = any("/" in name for name in used)
     there = (photographs_below if nested else photographs_in)(source.photographs)
     names = {path.relative_to(source.photographs).as_posix() for path in there}

@@ -162,8 +162,8 @@ def _hint(folder: Path, file: Path, named: Sequence[Path]) -> str:
     return f" ({near})" if near else ""
 
 
-def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -> str:
-    """Describe files found under other names; empty = none. A missing extension or other separators do not count."""
+def report_renamed(source: str, names: Sequence[str], files: Sequence[Path], folder: Path) -> None:
+    """Report files found under other names. A missing extension or other separators do not count."""
 
     def is_usual(name: str, file: Path) -> bool:
         plain = Path(os.path.normpath(folder / name.replace("\\", "/")))
@@ -174,14 +174,13 @@ def renamed_message(names: Sequence[str], files: Sequence[Path], folder: Path) -
         for name, file in zip(names, files, strict=True)
         if file.is_relative_to(folder) and not is_usual(name, file)
     ]
-    return f"{len(other)} of {len(names)} photographs have other names than it says: {listed(other)}." if other else ""
+    if other:
+        say(f"{source}: {len(other)} of {len(names)} photographs have other names than it says: {listed(other)}.")
 
 
 def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:
     """Report files with other names than stated, and warn of those outside the folder, as results will show them."""
-    other = renamed_message(names, files, path.parent)
-    if other:
-        say(f"{path}: {other}")
+    report_renamed(str(path), names, files, path.parent)
     folder = os.path.normpath(path.parent)
     pictures = dict.fromkeys(Path(os.path.normpath(file)) for file in (*files, *masks) if file is not None)
     outside = [file for file in pictures if not file.is_relative_to(folder) and os.path.isfile(file)]

@@ -187,11 +187,12 @@ def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str],
             model == "auto" and (closed or len(told) >= TELLING * len(alike) > 0.0)
         )
         if model == "auto" and len(told) not in (0, len(alike)):
-            size, other = f"{key[1]} x {key[2]}", "SIMPLE_RADIAL" if decided[key] else SPHERICAL_MODEL
-            what = "360-degree pictures" if decided[key] else "photographs"
+            kinds = ("360-degree pictures", "photographs")[:: 1 if decided[key] else -1]
+            other = "SIMPLE_RADIAL" if decided[key] else SPHERICAL_MODEL
             warn(
-                f"{len(told)} of {len(alike)} photographs of {size} pixels in {source / key[0]} look like 360-degree "
-                f"pictures: all of them are taken for {what}; camera model {other} takes them for the other."
+                f"{len(told)} of {len(alike)} photographs of {key[1]} x {key[2]} pixels in {source / key[0]} look like "
+                f"360-degree pictures: all are read as {kinds[0]}. `bitymi-data --sfm.camera-model {other}` reads all "
+                f"as {kinds[1]}."
             )
     photos = [replace(p, panorama=decided[os.path.dirname(p.name), p.width, p.height]) for p in photos]
     partial = [photo.name for photo in photos if photo.panorama and not is_full_sphere(photo.width, photo.height)]

@@ -40,7 +40,6 @@ class Source:
 
     folder: Path  # of the model
     photographs: Path  # folder to which names in the model are relative
-    downscale: int = 1  # factor by which photographs are reduced
     left_out: Mapping[str, str] = field(default_factory=dict)  # photographs that the model lacks, and known reasons
     report: Path | None = None  # folder of the report on structure from motion; None = none
     origin: Origin | None = None  # None = the capture came with the model
@@ -50,16 +49,10 @@ class Source:
         """The model; see `read_model`."""
         return read_model(self.folder)
 
-    @property
-    def image_folder(self) -> Path:
-        """Folder of the files that are read: reduced copies such as `images_2` if there are any."""
-        smaller = self.photographs.with_name(f"{self.photographs.name}_{self.downscale}")
-        return smaller if self.downscale > 1 and smaller.is_dir() else self.photographs
-
     def files(self) -> list[Path]:
         """Find the files of the model's images; for a missing one, return the path that the model names."""
         names = [image.name for image in self.model.images]
-        finder = FileFinder(self.image_folder)
+        finder = FileFinder(self.photographs)
         return [path or finder.missing(name) for path, name in zip(finder.find_all(names), names, strict=True)]
 
     def describe(self) -> str:
@@ -69,10 +62,7 @@ class Source:
         kinds = Counter(model.cameras[number].model for number in used)
         cameras = " and ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
         text = f"COLMAP model {self.folder} ({len(model.images)} photographs, {cameras} camera"
-        text += f"{'s' if len(used) > 1 else ''}, {len(model.xyz):,} points), photographs {self.image_folder}"
-        if self.downscale > 1 and self.image_folder == self.photographs:
-            text += f", reduced {self.downscale} times as they are read"
-        return text
+        return f"{text}{'s' if len(used) > 1 else ''}, {len(model.xyz):,} points), photographs {self.photographs}"
 
 
 def find_source(found: Found, images: Path | None, downscale: int, need_photos: bool) -> Source:
@@ -87,7 +77,7 @@ def find_source(found: Found, images: Path | None, downscale: int, need_photos: 
             f"of the photographs of {found.path}, of {camera.width} x {camera.height} pixels, only copies of "
             f"{size[0]} x {size[1]} are there, in {photographs}: `bitymi-data --downscale-factor {factor}` uses them."
         )
-    return Source(found.path, photographs, downscale)
+    return Source(found.path, photographs)
 
 
 def _find_folder(
@@ -139,7 +129,7 @@ def _find_folder(
 def warn_left_out(source: Source) -> set[Path]:
     """Report photographs that the model lacks or names differently; return the paths of all, in the model or not."""
     files = source.files()
-    stated, folder = [image.name for image in source.model.images], source.image_folder
+    stated, folder = [image.name for image in source.model.images], source.photographs
     report_renamed(f"The COLMAP model {source.folder}", stated, files, folder)
     used = {path.relative_to(folder).as_posix() if path.is_relative_to(folder) else path.name for path in files}
     nested = any("/" in name for name in used)
@@ -155,11 +145,11 @@ def warn_left_out(source: Source) -> set[Path]:
 
 def photographs_of(source: Source) -> list[Photograph]:
     """List the photographs of a model in the order of their names, with cameras and poses."""
-    model, reduced, found = source.model, source.image_folder != source.photographs, []
+    model, found = source.model, []
     for image, file in zip(model.images, source.files(), strict=True):
         camera, pose = model.cameras[image.camera_id], TO_Z_UP @ _camera_to_world(image)
         label = f"camera {image.camera_id} of {source.folder}"
-        found.append(Photograph(file, camera, pose, label, None, reduced, image.frame))
+        found.append(Photograph(file, camera, pose, label, frame=image.frame))
     return found
 
 

@@ -276,7 +276,7 @@ def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> l
         flat = folder / f"images_{downscale}" / file.name
         if len(inside) == 1:
             return [flat]
-        return list(dict.fromkeys((folder.joinpath(f"{inside[0]}_{downscale}", *inside[1:]), flat)))
+        return [folder.joinpath(f"{inside[0]}_{downscale}", *inside[1:]), *([flat] if inside[0] == "images" else [])]
 
     def mask_copy(mask: Path | None) -> Path | None:
         small = None if mask is None else folder / f"masks_{downscale}" / mask.name

@@ -12,14 +12,14 @@ import numpy as np
 
 from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_points, photographs_of, warn_left_out
-from bitymi_ns.capture.find_files import check_photographs_exist, name_unused
+from bitymi_ns.capture.find_files import check_photographs_exist, downscaled, name_unused
 from bitymi_ns.capture.folder_contents import photo_folder
 from bitymi_ns.capture.frame import read_frame
 from bitymi_ns.capture.masks import check_masks, with_masks
 from bitymi_ns.capture.points import Points, cloud_beside, read_cloud, with_colors
 from bitymi_ns.capture.pose_checks import fit_scale
 from bitymi_ns.capture.readings import AUTO, WRITTEN, Reading, as_meant
-from bitymi_ns.capture.recognise import Format, Found, is_model, recognise
+from bitymi_ns.capture.recognise import SPLITS, Format, Found, is_model, recognise
 from bitymi_ns.capture.scanner_views import Y_UP, scanner_photographs
 from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, lists_by_name, read_split_lists
@@ -114,14 +114,13 @@ class CaptureOptions(SplitOptions, FrameOptions):
 
     def source(self, found: Found, need_photos: bool = True) -> Source:
         """Find the COLMAP model and its photographs; photographs without poses go through structure from motion."""
-        downscale, kept = self.downscale_factor or 1, self.kept()
         if found.format == "colmap":
-            return find_source(found, self.images_path, downscale, need_photos)
-        if kept is not None:
-            return kept_source(found, kept, downscale, need_photos)
+            return find_source(found, self.images_path, self.downscale_factor or 1, need_photos)
+        if (kept := self.kept()) is not None:
+            return kept_source(found, kept, need_photos)
         if self.poses is not None:
             warn(f"The poses that the run was trained with are no longer in {self.poses}: others can be found now.")
-        return find_sfm_source(found, self.masks_path, downscale, self.sfm, self.use_masks)
+        return find_sfm_source(found, self.masks_path, self.sfm, self.use_masks)
 
 
 @dataclass
@@ -189,9 +188,19 @@ class _Reader:
         return self.options.downscale_factor or 1
 
     def _read_transforms(self, path: Path) -> Transforms:
-        own_format = self.found.format == "nerfstudio"
-        masks = (self.options.use_masks, self.options.masks_path)
-        return read_transforms(path, own_format, self.downscale, self.need_photos, *masks)
+        read = read_transforms(path, self.found.format == "nerfstudio", self.need_photos, self.options.use_masks)
+        base = path.parent if path.name in SPLITS else None
+        return replace(read, photographs=self._prepared(read.photographs, path.parent, base))
+
+    def _prepared(
+        self, photographs: list[Photograph], folder: Path, base: Path | None = None, images: Path | None = None
+    ) -> list[Photograph]:
+        """Add masks, see `with_masks`, and replace photographs by smaller copies in a `folder`, see `downscaled`."""
+        stated = self.options.masks_path
+        masked = self.options.use_masks and (stated is not None or not any(each.mask for each in photographs))
+        if self.need_photos and masked and self.found.format != "video":
+            photographs = with_masks(photographs, self.found.folder, base, stated, self.downscale, images)
+        return downscaled(photographs, folder, self.downscale) if self.downscale > 1 else photographs
 
     def _transforms(self) -> Capture:
         """Read a transforms.json."""
@@ -233,16 +242,10 @@ class _Reader:
         options, found, need_photos = self.options, self.found, self.need_photos
         source = options.source(found, need_photos)
         model = source.model
-        if need_photos and found.format == "colmap":
-            check_photographs_exist(found.path, source.files())
         named = warn_left_out(source) if need_photos else set()
         photographs, where = photographs_of(source), str(source.folder)
-        if need_photos and options.use_masks and found.format != "video":
-            base = source.photographs if found.format == "colmap" else photo_folder(found.path)
-            photographs = with_masks(
-                photographs, found.folder, base, options.masks_path, source.downscale, source.image_folder
-            )
-        named |= {each.mask for each in photographs if each.mask is not None}
+        base = source.photographs if found.format == "colmap" else photo_folder(found.path)
+        photographs = self._prepared(photographs, source.photographs.parent, base, source.photographs)
         photographs = self._checked(source.describe(), photographs, named, where)
         own = model_points(model, TO_Z_UP)
         if need_photos and self.want_points and options.points == "auto":
@@ -250,17 +253,16 @@ class _Reader:
         points = self._points(own, photographs, where)
         lists = read_split_lists(found.folder, source.folder, [each.file for each in photographs])
         return Capture(
-            found.format, where, photographs, points, options, lists, {}, source.downscale, TO_Z_UP,
+            found.format, where, photographs, points, options, lists, {}, self.downscale, TO_Z_UP,
             report=source.report, model=None if source.origin is None else source,
         )  # fmt: skip
 
     def _scanned(self) -> Capture:
         """Read the capture of a scanning program."""
         found = self.found
-        photographs, source = scanner_photographs(found, self.need_photos), str(found.path)
-        if self.need_photos and self.options.use_masks:
-            photographs = with_masks(photographs, found.folder, None, self.options.masks_path, self.downscale)
-        named = {file for each in photographs for file in (each.file, each.mask)}
+        photographs, source = scanner_photographs(found), str(found.path)
+        photographs = self._prepared(photographs, found.folder)
+        named = [each.file for each in photographs]
         what = f"{source} ({found.format}, {len(photographs)} photographs with their poses)"
         photographs = self._checked(what, photographs, named, source)
         points = self._points(None, photographs, source)
@@ -311,6 +313,7 @@ class _Reader:
         if self.found.format in ("photographs", "video"):
             return list(photographs)
         if self.need_photos:
+            named = (*named, *(each.mask for each in photographs))
             name_unused(self.found.folder, named, self.options.downscale_factor)
         convention, asked = CONVENTIONS.get(self.found.format, (Reading(), np.eye(4))), self.options.poses_as
         asked = asked if asked != AUTO or self.need_photos else WRITTEN

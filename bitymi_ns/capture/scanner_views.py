@@ -11,7 +11,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.depth_normal_maps import MapFiles, maps_beside, maps_called
-from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.folder_contents import photographs_in
 from bitymi_ns.capture.image_files import image_size, in_proportion
 from bitymi_ns.capture.order import natural
@@ -40,9 +39,9 @@ Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0
 """Transform of ARKit's world, y up, to z up."""
 
 
-def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
+def scanner_photographs(found: Found) -> list[Photograph]:
     """Read a capture's photographs, with cameras and poses, in the order of their names. Raises CaptureError: a file is
-    damaged, or photographs that are needed are missing."""
+    damaged."""
     readers: dict[str, Callable[[Path], list[ScannedPhotograph]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
         "3d-scanner": _scanner_app, "stray-scanner": _stray_scanner,
@@ -56,8 +55,6 @@ def scanner_photographs(found: Found, need_photos: bool) -> list[Photograph]:
     if len(rows) < 2:
         fail(f"{what} has {len(rows)} photographs with poses: a scene needs many.")
     files = [row.file for row in rows]
-    if need_photos:
-        check_photographs_exist(found.path, files)
     parts = rotations(np.stack([row.pose[:3, :3] for row in rows]), [file.name for file in files], str(found.path))
     result = []
     for (path, pose, pinhole, stated, own), rotation, beside in zip(rows, parts, maps_beside(files), strict=True):

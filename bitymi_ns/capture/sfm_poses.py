@@ -41,9 +41,7 @@ class KeptPoses:
         return Found(self.origin.kind, folder / self.origin.path, folder)
 
 
-def find_sfm_source(
-    found: Found, masks_path: Path | None, downscale: int, settings: SfmSettings, use_masks: bool = True
-) -> Source:
+def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings, use_masks: bool = True) -> Source:
     """Run structure from motion on photographs or a video, or find an earlier run's model. `masks_path` is relative to
     the capture, None = find it. Raises CaptureError: no poses can be found; says what to photograph differently."""
     from bitymi_ns.capture.poses import find_poses  # slow to import
@@ -65,7 +63,7 @@ def find_sfm_source(
         say(by_gps)
     if poses.doubt:
         warn(poses.doubt)
-    source = Source(poses.model, poses.images, downscale, poses.left_out)
+    source = Source(poses.model, poses.images, poses.left_out)
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames are in the work folder
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
@@ -73,18 +71,17 @@ def find_sfm_source(
     return replace(source, report=poses.report, origin=origin)
 
 
-def kept_source(found: Found, kept: KeptPoses, downscale: int, need_photos: bool) -> Source:
+def kept_source(found: Found, kept: KeptPoses, need_photos: bool) -> Source:
     """Return the model that a run was trained with. Raises CaptureError: needed photographs of it are missing, or have
     changed their size."""
     photographs = kept.origin.photographs
     images = kept.folder / IMAGES if photographs is None else found.folder / photographs
-    source = Source(kept.folder / MODEL, images, downscale, kept.left_out)
+    source = Source(kept.folder / MODEL, images, kept.left_out)
     if need_photos:
         files = source.files()
         missing = [file.readlink() if file.is_symlink() else file for file in files if not os.path.isfile(file)]
         changed = []
-        sizes = in_threads(image_size, files) if source.image_folder == images else [None] * len(files)
-        for image, file, size in zip(source.model.images, files, sizes, strict=True):
+        for image, file, size in zip(source.model.images, files, in_threads(image_size, files), strict=True):
             camera = source.model.cameras[image.camera_id]
             if size not in (None, camera.size):
                 changed.append(f"{file}: {size[0]} x {size[1]} pixels, {camera.width} x {camera.height} then")

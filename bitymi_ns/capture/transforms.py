@@ -15,9 +15,7 @@ import numpy as np
 from bitymi_ns.capture import find_files
 from bitymi_ns.capture.image_files import image_size
 from bitymi_ns.capture.lens import colmap_distortion
-from bitymi_ns.capture.masks import with_masks
 from bitymi_ns.capture.pose_checks import as_matrix, correct_poses
-from bitymi_ns.capture.recognise import SPLITS
 from bitymi_ns.capture.splits import NameLists
 from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say
 from bitymi_ns.safe_reading import read_json
@@ -64,19 +62,12 @@ class Transforms:
     meta: dict[str, Any]  # content
     photographs: list[Photograph]  # sorted by file name
     lists: NameLists  # of names for training and evaluation
-    named: frozenset[Path]  # pictures, masks and maps, before downscaled copies replace them
+    named: frozenset[Path]  # pictures, masks and maps
 
 
-def read_transforms(
-    path: Path,
-    own_format: bool,
-    downscale: int = 1,
-    need_photos: bool = True,
-    use_masks: bool = True,
-    masks_path: Path | None = None,
-) -> Transforms:
-    """Read a JSON file, see `load_transforms`, and find its photographs, or copies smaller by `downscale`, its maps and
-    masks, see `with_masks`. Raises CaptureError: the file cannot be used, or lacks photographs that are needed."""
+def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_masks: bool = True) -> Transforms:
+    """Read a JSON file, see `load_transforms`, and find its photographs, maps and masks. Raises CaptureError: the file
+    cannot be used."""
     meta = load_transforms(path, own_format)
     frames = meta["frames"]
     lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
@@ -107,12 +98,7 @@ def read_transforms(
         pose = np.array(frame["transform_matrix"])
         photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask, maps=beside))
     photographs.sort(key=lambda photograph: photograph.file)
-    if use_masks and need_photos and (masks_path or not any(masks)):
-        base = path.parent if path.name in SPLITS else None
-        photographs = with_masks(photographs, path.parent, base, masks_path, downscale)
-    used = [*files, *(each.mask for each in photographs), *(file for each in maps for file in astuple(each))]
-    if downscale > 1:
-        photographs = find_files.downscaled(photographs, path.parent, downscale)
+    used = [*files, *masks, *(file for each in maps for file in astuple(each))]
     named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
     return Transforms(path, meta, photographs, NameLists(lists), named)
 

@@ -41,5 +41,5 @@ def test_poses_are_found_with_the_masks_of_the_training(
     Image.new("RGB", (8, 6)).save(tmp_path / photographs / "a.png")
     found = recognise(tmp_path / data, "photographs")
     with pytest.raises(CaptureError, match="not now"):
-        sfm_poses.find_sfm_source(found, given, 1, SfmSettings())
+        sfm_poses.find_sfm_source(found, given, SfmSettings())
     assert asked == [None if masks is None else tmp_path / masks]

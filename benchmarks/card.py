@@ -24,7 +24,7 @@ NEEDED += ("wgpu", "cffi", "pycparser", "rendercanvas")
 NEEDED += ("nerfstudio", "viser", "websockets", "msgspec", "trimesh", "tyro", "docstring-parser", "typeguard")
 NEEDED += ("appdirs", "mediapy", "pyquaternion", "pytorch-msssim", "splines", "pycolmap", "nerfacc")
 """Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt.
-nerfstudio's other imports have stand-ins (card_nerfstudio.py)."""
+nerfstudio's other imports have stand-ins (gpu_nerfstudio.py)."""
 TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 
 
@@ -45,7 +45,7 @@ def python(script: str, *words: str) -> list[str]:
 def sanitizer(tool: str, *sections: str) -> list[str]:
     """Build a command that runs kernels under a tool of compute-sanitizer."""
     command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", "--print-limit", "20"]
-    return [*command, *python("gpu_kernels.py", "--sections", *sections)]
+    return [*command, *python("times.py", "cuda", "--sections", *sections)]
 
 
 def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
@@ -79,18 +79,22 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
         "check": [
             Step("block textures", [[sys.executable, "-c", BLOCKS]], 60),
             Step("tests", [[*pytest, "tests/cuda", "-k", "not emulated"]], 240),
-            Step("kernels", [python("gpu_kernels.py", *large, "--times", "20")], 90),
+            Step("kernels", [python("times.py", "cuda", *large, "--times", "20")], 90),
             Step("sanitizers", [sanitizer(tool, *CHECKED) for tool in SANITIZERS], 150),
         ],
         "train": of_each(
             "", 600, lambda name: [page(name, "long.py", data / name, "--keep", bundles / name, *on_card)]
         ),
-        "frames": [Step("frames", [page("frames", "gpu.py", "--runs", "100", "--surfels", *surfels, *bundled)], 200)],
+        "frames": [
+            Step(
+                "frames", [page("frames", "times.py", "frames", "--runs", "100", "--surfels", *surfels, *bundled)], 200
+            )
+        ],
         "gaussians": of_each(
             "Gaussians of ",
             300,
             lambda name: [
-                python("gpu_peers.py", str(data / name), "--train", str(count), "--gaussians", str(results / name))
+                python("times.py", "peers", *map(str, (data / name, "--train", count, "--gaussians", results / name)))
                 for count in GAUSSIANS
             ],
         ),
@@ -98,14 +102,14 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             "peers on ",
             120,
             lambda name: [
-                page(f"{name}-peers", "gpu_peers.py", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
+                page(f"{name}-peers", "times.py", "peers", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
                 + ["--gaussians", str(results / name)]
             ],
         ),
         "kernels": [
             Step(
                 f"kernels of bundles, {size}",
-                [python("gpu_kernels.py", "--sections", "--size", size, "--times", "20", *bundled)],
+                [python("times.py", "cuda", "--sections", "--size", size, "--times", "20", *bundled)],
                 60,
             )
             for size in ("1297x840", "3840x2160")
@@ -114,7 +118,7 @@ def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | 
             "nerfstudio on ",
             600,
             lambda name: [
-                page(f"{name}-nerfstudio", "card_nerfstudio.py", data / name, "--folder", results / f"{name}-runs")
+                page(f"{name}-nerfstudio", "times.py", "nerfstudio", data / name, "--folder", results / f"{name}-runs")
                 + length
             ],
         ),
@@ -133,7 +137,7 @@ def together(steps: Sequence[Step]) -> Step:
 
 
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-CHECKED = ("baked", "training", "texels", "listed")  # sections of gpu_kernels.py
+CHECKED = ("baked", "training", "texels", "listed")  # sections of `times.py cuda`
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 
 

@@ -1,11 +1,9 @@
-#!/usr/bin/env python
 """Run each CUDA kernel once on a small scene, for sanitizers.
 
 `--sections baked training` selects kernels; `--times RUNS` prints the device time by kernel.
 """
 
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -89,15 +87,14 @@ SECTIONS = {"baked": baked, "images": images, "training": training, "texels": te
 SECTIONS |= {"listed": partial(texels, most=1 << 30), "deterministic": exact}
 
 
-def main() -> int:
+def main(parser: Arguments, words: Sequence[str]) -> None:
     """Run or time the chosen kernels."""
-    parser = Arguments(__doc__)
     parser.add_argument("--surfels", type=int, default=300)
     parser.add_argument("--size", type=image_size, default="96x64", metavar="WxH", help="image size (%(default)s)")
     parser.add_argument("--sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="draw these as well")
     parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     device = parser.device()
     if not arguments.sections and not arguments.bundles:
         parser.error("there is nothing to run: no section and no bundle is named")
@@ -111,7 +108,6 @@ def main() -> int:
             run()
             torch.cuda.synchronize()
             print(f"{name}: done", flush=True)
-    return 0
 
 
 def print_times(name: str, run: Callable[[], object], runs: int) -> None:
@@ -130,7 +126,3 @@ def print_times(name: str, run: Callable[[], object], runs: int) -> None:
     longest = sorted(kernels, key=lambda e: -e.self_device_time_total)[:45]
     rows = [(f"`{e.key[:90]}`", f"{e.count / runs:.1f}", f"{e.self_device_time_total / runs:.1f}") for e in longest]
     print(table(("kernel", "per run", "us per run"), rows))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,13 +1,11 @@
-#!/usr/bin/env python
 """Compare bundles with gsplat at equal quality on a GPU: train Gaussians, in several numbers, on the same photographs
 with gsplat's MCMC strategy, and render both at the held-out cameras: PSNR and ms per frame.
 
 Bundles are those of `long.py --keep`. `--train` trains the Gaussians first, from the same points, with the learning
 rates of gsplat's example and the strategy's regularisation."""
 
-import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -183,9 +181,8 @@ def row(
     return [*cells, number(good["ssim"], 3), *(number(ms, 3) for ms in frames)]
 
 
-def main() -> int:
+def main(parser: Arguments, words: Sequence[str]) -> None:
     """Train Gaussians, or measure all renderers and publish the table."""
-    parser = Arguments(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--train", nargs="+", type=int, metavar="COUNT", help="train so many Gaussians, draw nothing")
     parser.add_argument("--steps", type=int, default=20_000, help="of training Gaussians (%(default)s)")
@@ -193,7 +190,7 @@ def main() -> int:
     parser.add_argument("--bundles", nargs="*", type=Path, default=[], help="baked scenes of the same capture")
     parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
     parser.add_output()
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     device = parser.device()
     capture = load_capture(arguments.data.expanduser())
     gsplat, why = load()
@@ -205,7 +202,7 @@ def main() -> int:
             trained = train(gsplat, capture, most, arguments.steps, device)
             torch.save(trained, arguments.gaussians / f"{most}.pt")
             say(f"{most:,} Gaussians, {arguments.steps:,} steps: {trained[1]:.0f} s")
-        return 0
+        return
     camera, every = capture.held_out[0].camera, max(1, len(capture.held_out) // CAMERAS)
     timed = [view.camera.to(device) for view in capture.held_out[::every][:CAMERAS]]
     times = {k: [camera.scaled(k) for camera in timed] for k in arguments.times}
@@ -226,8 +223,3 @@ def main() -> int:
     for name, count, took, make in made:
         rows.add(f"{name}, {count:,}", partial(row, name, count, took, make, capture, times))
         publish(f"Equal quality: {arguments.data.name}", f"{about}\n\n{rows}", notes, arguments.output)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

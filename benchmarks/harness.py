@@ -23,9 +23,9 @@ CLOCK = 2.0e9  # upper bound of GPU clocks, Hz, to convert seconds to cycles of 
 class Arguments(argparse.ArgumentParser):
     """Command line of a script, with its docstring as help text."""
 
-    def __init__(self, script: str | None) -> None:
+    def __init__(self, script: str | None, name: str | None = None) -> None:
         formatter = argparse.RawDescriptionHelpFormatter
-        super().__init__(description=script, formatter_class=formatter, allow_abbrev=False)
+        super().__init__(name, description=script, formatter_class=formatter, allow_abbrev=False)
 
     def add_output(self) -> None:
         """Add the option of `publish`."""

@@ -3,18 +3,16 @@
 The emulated kernels return at once, so the time is that of Python, torch and the bindings; a GPU's launches and
 allocator add to it. Waits are operations of torch that read from the device. Losses are checked in every step here,
 every few on a GPU, because the emulated device is the CPU.
-
-    python benchmarks/host.py [--exposure gain]
 """
 
-import argparse
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from types import ModuleType
 
 import torch
+from harness import Arguments, number, publish, table
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -26,6 +24,7 @@ from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.views import View
 
 STEPS, TEXELS, MEASURED, COUNTED = 30_000, 600, 400, 20  # steps of the run, before texels, timed and counted
+HEADER = ("stage", "ms of CPU time, median", "least", "kernels", "other operations", "views, detached", "waits")
 READS = ("local_scalar_dense", "nonzero")
 VIEWED = ("detach", "view", "select", "slice", "unbind", "alias", "expand", "as_strided", "squeeze")  # launch nothing
 
@@ -62,7 +61,7 @@ def idle(emulator: ModuleType) -> Iterator[None]:
             setattr(where, name, value)
 
 
-def row(run: Trainer, emulator: ModuleType, stage: str) -> str:
+def row(run: Trainer, emulator: ModuleType, stage: str) -> list[str]:
     """Measure steps of a run and return a row of the table."""
     launched = emulator.launches()
     with Counted() as counted:
@@ -76,8 +75,8 @@ def row(run: Trainer, emulator: ModuleType, stage: str) -> str:
         times.append(1e3 * (time.thread_time() - started))
     viewed, waits = counted.per_step(VIEWED), counted.per_step(READS)
     other = len(counted.names) / COUNTED - viewed - waits
-    figures = (f"{kernels:.0f}", f"{other:.0f}", f"{viewed:.0f}", f"{waits:.0f}")
-    return f"| {stage} | {statistics.median(times):.2f} | {min(times):.2f} | {' | '.join(figures)} |"
+    least = [number(statistics.median(times)), number(min(times))]
+    return [stage, *least, *(number(figure, 0) for figure in (kernels, other, viewed, waits))]
 
 
 def trainer(exposure: str) -> Trainer:
@@ -93,23 +92,18 @@ def trainer(exposure: str) -> Trainer:
     return Trainer(scene, views, config, STEPS)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(parser: Arguments, words: Sequence[str]) -> None:
     parser.add_argument("--exposure", default="off", choices=("off", "gain", "affine"))
-    exposure = parser.parse_args().exposure
+    parser.add_output()
+    arguments = parser.parse_args(words)
     torch.set_num_threads(1)
     emulator = load("_emulated")
     with emulated_cuda():
-        run = trainer(exposure)
-        print("| stage | ms of CPU time, median | least | kernels | other operations | views, detached | waits |")
-        print("|---|---:|---:|---:|---:|---:|---:|")
+        run, rows = trainer(arguments.exposure), []
         for stage, first in (("surfels", 0), ("texels", TEXELS)):
             run.step = first
             for _ in range(2):  # creates optimisers' states and tiles
                 run.advance()
             with idle(emulator):
-                print(row(run, emulator, stage))
-
-
-if __name__ == "__main__":
-    main()
+                rows.append(row(run, emulator, stage))
+    publish("The host's share of a step", table(HEADER, rows), (), arguments.output)

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Compare each CPU kernel with the machine's ceilings, on a scene like a trained one (`scenes.trained_like`).
 
 The baked scene has a uint8 atlas with a tile per surfel, at one texel per pixel. Kernels are called through
@@ -20,7 +19,6 @@ weight bound), b pairs of surfel and tile (r with a fragment), K sites, L levels
 
 import math
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -148,9 +146,8 @@ def cases(n: int, width: int, height: int) -> tuple[str, list[Case]]:
     ]  # fmt: skip
 
 
-def main() -> int:
+def main(parser: Arguments, words: Sequence[str]) -> None:
     """Time the kernels and publish a table per scene."""
-    parser = Arguments(__doc__)
     parser.add_argument("--surfels", nargs="+", type=int, default=[5_000, 20_000], help="sizes of the scene")
     parser.add_argument("--width", type=int, default=270)
     parser.add_argument("--height", type=int, default=480)
@@ -159,7 +156,7 @@ def main() -> int:
     parser.add_argument("--gbytes", type=float, default=77.0, help="memory triad, GB/s (%(default)s)")
     parser.add_argument("--mloads", type=float, default=2050.0, help="random loads in 8 MiB, M/s (%(default)s)")
     parser.add_output()
-    options = parser.parse_args()
+    options = parser.parse_args(words)
     ceilings = (options.gflops * 1e9, options.gbytes * 1e9, options.mloads * 1e6)
     parts, load = [], os.getloadavg()[0]
     for n in options.surfels:
@@ -187,8 +184,3 @@ def main() -> int:
         "Operations and bytes are counted by the formulas of this script.",
     ]
     publish("CPU kernels", "\n\n".join(parts), notes, options.output)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -25,14 +25,14 @@ except RuntimeError as error:
 
 
 def test_stand_ins_are_imported_and_their_use_is_an_error(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
-    environment = load("card_nerfstudio").stand_in(tmp_path)
+    environment = load("gpu_nerfstudio").stand_in(tmp_path)
     done = subprocess.run([sys.executable, "-c", USE], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "open3d.io.read_point_cloud is a stand-in: the package is not on this machine"
 
 
 def test_commands_are_tabled_with_what_they_left(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
     written: list[int] = []
-    card = load("card_nerfstudio")
+    card = load("gpu_nerfstudio")
     environment = card.stand_in(tmp_path / "stand-ins")
     commands = card.Commands(tmp_path, environment, lambda: written.append(len(commands.rows)))
     assert commands.run(sys.executable, "-c", "x = bytearray(200_000_000)")

@@ -7,7 +7,7 @@ from pathlib import Path
 from tests.cuda.conftest import why_not_emulated
 from tests.required import skip_without
 
-SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "gpu.py"
+SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "times.py"
 
 
 def test_frames_without_a_card(tmp_path: Path) -> None:
@@ -15,7 +15,7 @@ def test_frames_without_a_card(tmp_path: Path) -> None:
     if reason := why_not_emulated():
         skip_without("emulated", reason)
     page = tmp_path / "page.md"
-    command = [sys.executable, str(SCRIPT), "--emulated", "--output", str(page)]
+    command = [sys.executable, str(SCRIPT), "frames", "--emulated", "--output", str(page)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     text = page.read_text("utf8")

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Run nerfstudio's commands on a capture and tabulate time and memory: train, resume, evaluate, export, evaluate and
 render the bundle.
 
@@ -184,7 +183,7 @@ def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str]
         commands.run("ns-render", "dataset", "--load-config", bundle, "--output-path", "maps", *names)
     if commands.rows[0][2] is not None:
         short = (*train[1:], "--timestamp", "waits", "--max-num-iterations", WAITS_STEPS, *options)
-        commands.run(sys.executable, Path(__file__).resolve(), "--waits", *short)
+        commands.run(sys.executable, Path(__file__).with_name("times.py"), "nerfstudio", "--waits", *short)
 
 
 def tables(folder: Path, commands: Commands) -> str:
@@ -202,18 +201,17 @@ def tables(folder: Path, commands: Commands) -> str:
     return f"{text}\n\n{table(('', 'PSNR', 'SSIM', 'LPIPS', 'surfels'), quality)}"
 
 
-def main() -> int:
+def main(parser: Arguments, words: Sequence[str]) -> int:
     """Run the commands on a capture and publish their costs; return 1 if any failed."""
-    if sys.argv[1:2] == ["--waits"]:
-        waits(sys.argv[2:])
+    if words[:1] == ["--waits"]:
+        waits(words[1:])
         return 0
-    parser = Arguments(__doc__)
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--steps", type=int, default=3000, help="length of the run (%(default)s)")
     parser.add_argument("--folder", type=Path, required=True, help="of runs, bundle and log; emptied first")
     parser.add_output()
     parser.add_argument("--options", nargs="...", default=[], help="of ns-train, at the end")
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     folder, capture = arguments.folder.resolve(), arguments.data.resolve()
     shutil.rmtree(folder, ignore_errors=True)
     title = f"nerfstudio on {capture.name}, {arguments.steps} steps"
@@ -228,7 +226,3 @@ def main() -> int:
     commands = Commands(folder, stand_in(folder / "stand-ins"), write)
     all_commands(capture, folder, arguments.steps, arguments.options, commands)
     return int(any(cost is None for _, cost, _ in commands.rows))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,3 @@
-#!/usr/bin/env python
 """Time frames of baked scenes on a GPU (medians after a warm-up) and print a table.
 
 Scenes: those of `scenes.textured`, and bundles (--bundles) with three cameras around their centre. "list" and "draw"
@@ -11,7 +10,6 @@ script without a GPU; its times are meaningless.
 """
 
 import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
@@ -107,9 +105,8 @@ def card(device: torch.device) -> list[str]:
     ]
 
 
-def main() -> int:
+def main(parser: Arguments, words: Sequence[str]) -> None:
     """Time the scenes and publish the table."""
-    parser = Arguments(__doc__)
     parser.add_argument("--surfels", nargs="*", type=int, default=[50_000, 150_000, 500_000], help="of the scenes")
     parser.add_argument("--sizes", nargs="+", type=image_size, default=SIZES, metavar="WxH", help="(%(default)s)")
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes to draw as well")
@@ -117,7 +114,7 @@ def main() -> int:
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--emulated", action="store_true", help="try the script without a card")
     parser.add_output()
-    arguments = parser.parse_args()
+    arguments = parser.parse_args(words)
     if arguments.emulated:
         surfels, sizes, options = [60], [(40, 24)], Options(torch.device("cpu"), 0, 1)
     else:
@@ -134,8 +131,3 @@ def main() -> int:
             for make, each in [(synthetic, n) for n in surfels] + [(bundled, folder) for folder in arguments.bundles]:
                 rows.add(f"{each}, {width} x {height}", partial(make, each, width, height, options))
     publish("Frames of baked scenes", str(rows), notes, arguments.output)
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -159,17 +159,10 @@ class Lens:
         return replace(self, camera=camera, pinhole=pinhole)
 
 
-def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
-    """Choose the pinhole picture of a camera, or faces of a cube if it is wider than MAX_VIEW_ANGLE. Raises
-    CaptureError: the camera cannot be used.
-
-    Args:
-        colmap: for the size to which photographs are downscaled.
-        stored: width and height of the image files, which may be larger.
-
-    Returns:
-        the lenses, and messages on what photographs become.
-    """
+def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list[Lens]:
+    """Choose the pinhole picture of a camera, for the size to which photographs are downscaled, or faces of a cube if
+    it is wider than MAX_VIEW_ANGLE. `stored`: width and height of the image files, which may be larger. Raises
+    CaptureError: the camera cannot be used."""
     model, width, height, params = colmap
     camera = colmap.colmap
     if camera.is_spherical():
@@ -178,7 +171,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
                 f"{label} is {model}, but its photographs have {width} x {height} pixels: pictures of all directions "
                 "are twice as wide as high. Correct the camera model, or pad the photographs to that shape."
             )
-        return _faces(colmap, stored, label)
+        return _faces(colmap, stored)
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         fail(
@@ -188,7 +181,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
     center = (camera.principal_point_x, camera.principal_point_y)
     lens = Lens(colmap, stored, Pinhole(*focal, *center, width, height))
     if not lens.distorts:
-        return [lens], []
+        return [lens]
     left, right, top, bottom = _window(colmap)
     w, h = int((left + right) * focal[0]), int((top + bottom) * focal[1])
     share = w * h / (width * height)
@@ -198,16 +191,8 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tupl
             f"leave {100.0 * share:.2g} % of the picture. Correct it, or calibrate a simpler model (SIMPLE_RADIAL)."
         )
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
-    across, down = pinhole.view
-    if max(across, down) > MAX_VIEW_ANGLE - 0.5:
-        return _faces(colmap, stored, label)
-    messages = []
-    if camera.is_perspective_fisheye():
-        messages.append(
-            f"{label} is {model}: its photographs are used as pinhole pictures of {across:.0f} x {down:.0f} degrees "
-            f"({w} x {h} pixels); what they show beyond is not used."
-        )
-    return [replace(lens, pinhole=pinhole)], messages
+    wide = max(pinhole.view) > MAX_VIEW_ANGLE - 0.5
+    return _faces(colmap, stored) if wide else [replace(lens, pinhole=pinhole)]
 
 
 def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_photos: bool = True) -> list[list[Lens]]:
@@ -229,8 +214,12 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
         key = (camera, used, photograph.downscaled)
         if key not in made:
             stored = used if photograph.downscaled else full
-            made[key], lost = lenses_of(camera.rescaled(*used), stored, photograph.label)
-            messages += lost
+            made[key] = lenses_of(camera.rescaled(*used), stored, photograph.label)
+            if made[key][0].face or camera.colmap.is_perspective_fisheye():
+                each = ", ".join(f"{one.face} {one.pinhole.width} x {one.pinhole.height}".strip() for one in made[key])
+                messages.append(
+                    f"{photograph.label} is {camera.model}: its photographs become pinhole pictures ({each})."
+                )
         lenses.append(made[key])
     for message in messages[:3]:
         say(f"{message[0].upper()}{message[1:]}")
@@ -239,7 +228,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
     return lenses
 
 
-def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[list[Lens], list[str]]:
+def _faces(colmap: ColmapCamera, stored: tuple[int, int]) -> list[Lens]:
     """Make lenses of the cube faces that a wide camera covers, with its focal length; see `lenses_of`."""
     camera = colmap.colmap
     around = colmap.width / (2.0 * math.pi)
@@ -257,9 +246,7 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> tuple[l
         w, h = max(1, round((right - left) * fx)), max(1, round((bottom - top) * fy))
         u, v = w / (right - left), h / (bottom - top)
         lenses.append(Lens(colmap, stored, Pinhole(u, v, -left * u, -top * v, w, h), face, whole))
-    named = ", ".join(f"{lens.face} {lens.pinhole.width} x {lens.pinhole.height}" for lens in lenses)
-    becomes = f"each of its photographs becomes {len(lenses)} pinhole pictures ({named})"
-    return lenses, [f"{label} is {colmap.model}: {becomes}."]
+    return lenses
 
 
 def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:

@@ -167,7 +167,7 @@ def test_depth_that_cannot_be_read_is_refused(capture) -> None:
         load(folder)
 
 
-LENS = lenses_of(ColmapCamera("PINHOLE", 64, 64, (60.0, 60.0, 32.0, 32.0)), (64, 64), "a camera")[0][0]
+LENS = lenses_of(ColmapCamera("PINHOLE", 64, 64, (60.0, 60.0, 32.0, 32.0)), (64, 64), "a camera")[0]
 
 
 def header(shape: str, descr: str = "<f8") -> bytes:
@@ -344,7 +344,7 @@ def test_maps_of_scanners(tmp_path) -> None:
     cv2.imwrite(str(tmp_path / "confidence/7.png"), confidence)
     (files,) = maps_beside([tmp_path / "images/7.jpg"])
     assert files == MapFiles(tmp_path / "depth/7.png", tmp_path / "confidence/7.png")
-    (lens,), _ = lenses_of(ColmapCamera("PINHOLE", 128, 96, (100.0, 100.0, 64.0, 48.0)), (128, 96), "")
+    (lens,) = lenses_of(ColmapCamera("PINHOLE", 128, 96, (100.0, 100.0, 64.0, 48.0)), (128, 96), "")
     read = read_depth(files, lens)
     assert read.shape == (96, 128) and not read[:2].any() and not read[-4:].any()
     assert np.allclose(read[2:-4], 1.5)
@@ -369,7 +369,7 @@ def test_color_pictures_in_a_scanners_depth_folder_are_not_used(tmp_path, capsys
 
 def test_distorted_photographs_have_their_depth_moved(tmp_path) -> None:
     camera = ColmapCamera("OPENCV", 64, 48, (60.0, 60.0, 32.0, 24.0, 0.1, 0.02, 0.0, 0.0))
-    (lens,), _ = lenses_of(camera, camera.size, "a camera")
+    (lens,) = lenses_of(camera, camera.size, "a camera")
     columns = np.broadcast_to(np.arange(1.0, 65.0), (48, 64))
     np.save(tmp_path / "depth.npy", columns)
     read = read_depth(MapFiles(tmp_path / "depth.npy"), lens)

@@ -77,7 +77,7 @@ def test_a_negative_side_is_refused(capture: Path) -> None:
 
 def test_a_lens_is_reduced_with_its_photographs() -> None:
     camera = ColmapCamera("SIMPLE_RADIAL", 960, 720, (800.0, 480.0, 360.0, 0.1))
-    (whole,), _ = lenses_of(camera, camera.size, "camera 1")
+    (whole,) = lenses_of(camera, camera.size, "camera 1")
     half = whole.downscaled(0.5)
     assert half.camera.size == (480, 360) and half.stored == (960, 720)
     assert half.pinhole.view == pytest.approx(whole.pinhole.view, abs=0.2)

@@ -141,7 +141,7 @@ def test_a_camera_model_wherever_it_stands(
     fisheyes = [lens for lens in lenses if lens.camera.model == "OPENCV_FISHEYE"]
     assert len(fisheyes) == (6 if which == "some frames" else 12)
     assert fisheyes[0].camera.params[4:] == (0.01, 0.0, 0.0, 0.001)
-    assert "is OPENCV_FISHEYE: its photographs are used as pinhole pictures" in printed(capsys)
+    assert "is OPENCV_FISHEYE: its photographs become pinhole pictures (" in printed(capsys)
 
 
 @pytest.mark.parametrize("form", JSON)

@@ -42,7 +42,7 @@ def test_a_capture_of_both_kinds(capture: Path, capsys: pytest.CaptureFixture[st
     names = panoramas(capture, 3)
     manager = load_any(capture, eval_interval=2)
     said = printed(capsys)
-    assert "is EQUIRECTANGULAR: each of its photographs becomes 6 pinhole pictures (front 31 x 31" in said
+    assert "is EQUIRECTANGULAR: its photographs become pinhole pictures (front 31 x 31" in said
     count = len(images_of(capture))
     assert f"Held out for evaluation: {(count + 1) // 2} of {count} photographs" in said
     held_out, train = manager.eval_dataset, manager.train_dataset

@@ -79,8 +79,8 @@ def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool, e
     """Make cameras.json, with colour corrections by the state of the run's `Exposure` (None: none), and, if asked for,
     the held-out photographs as JPEG of at most `MOST_PIXELS` along a side: contents by name of the file."""
     files: dict[str, bytes] = {}
-    files = [*datamanager.train_dataset.image_filenames, *datamanager.eval_dataset.image_filenames]
-    names = told_apart(files)
+    photos = [*datamanager.train_dataset.image_filenames, *datamanager.eval_dataset.image_filenames]
+    names = told_apart(photos)
     trained, held_out = datamanager.corrections(exposure)
     given = zip(names[: len(train)], train, trained, strict=True)
     rows = [CapturedCamera.of(name, camera, False, correction=of_camera) for name, camera, of_camera in given]

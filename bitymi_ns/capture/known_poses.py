@@ -11,6 +11,7 @@ import numpy as np
 
 from bitymi_ns.capture.cache import content_key, emptied, made_once, replace_stale
 from bitymi_ns.capture.colmap_model import read_model
+from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.image_files import from_header, image_size, read_image
 from bitymi_ns.capture.masks import colmap_mask
 from bitymi_ns.capture.points import Points
@@ -36,9 +37,7 @@ def triangulate(
         folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the poses, with image names
         relative to `capture`.
     """
-    missing = [view.file for view in views if not os.path.isfile(view.file)]
-    if missing:
-        raise CaptureError(f"{missing[0]} is missing ({len(missing)} of {len(views)}): put the photographs there")
+    check_photographs_exist(capture, [view.file for view in views])
     if len(views) < 2:
         raise CaptureError(f"{capture}: points need at least two photographs with poses, these are {len(views)}")
     names = [os.path.relpath(view.file, capture) for view in views]

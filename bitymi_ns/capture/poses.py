@@ -150,8 +150,7 @@ def _find(
         alike = len(twins) >= len(left_out) - len(twins)
         if video and alike:
             raise CaptureError(f"{source} {NO_MOTION}")
-        some = "; ".join(f"{name}: {why}" for name, why in list(left_out.items())[:3])
-        some += f"; and {len(left_out) - 3} more" if len(left_out) > 3 else ""
+        some = listed([f"{name}: {why}" for name, why in left_out.items()])
         use, then = "can be used", "copy or export them again"
         if alike:
             use, then = "differ", "take photographs from different places"

@@ -83,22 +83,24 @@ def share_on(cloud: Array, points: Array, centers: Array) -> float:
 
 
 def cloud_beside(
-    folder: Path, found: Points | None, photographs: Sequence[Photograph], read: Callable[[Path], Points]
+    folder: Path, found: Points | None, photographs: Sequence[Photograph], placed: Callable[[Points], Points]
 ) -> Points | None:
-    """Choose a PLY file in a folder that nothing names: the first with most points of surfaces on its own, of those
-    `found` by triangulation; None = none. Say why others are not used."""
+    """Read a PLY file in a folder that nothing names: the first on whose surfaces most of the points lie that were
+    `found` by triangulation; None = none. `placed` moves points of files to the poses' world. Say why others are not
+    used."""
     centers = np.stack([each.pose[:3, 3] for each in photographs])
     for path in sorted(folder.glob("*.ply")):
         try:
-            cloud = read(path)
+            cloud, without = read_cloud(path, "")
         except CaptureError as error:
             say(f"Not used: {error}")
             continue
+        cloud = placed(cloud)
         share = 0.0 if found is None or not len(cloud.xyz) else share_on(cloud.xyz, found.xyz, centers)
         why = f"{share:.0%} of the triangulated points lie on its surfaces"
         if share > SAME:
             say(f"Training starts from the points of {path}, which nothing names: {why}.")
-            return cloud
+            return with_colors(cloud, without, photographs, path)
         say(f"{path}, which nothing names, is not used: {why}. `bitymi-data --ply-path {path.name}` uses it.")
     return None
 

@@ -4,7 +4,6 @@ import math
 import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -325,9 +324,13 @@ class _Reader:
         return self._colored(points, reason, photographs, path)
 
     def _colored(self, points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
-        if (self.mirror != np.eye(4)).any():
-            points = points._replace(xyz=points.xyz @ self.mirror[:3, :3].T + self.mirror[:3, 3])
+        points = self._placed(points)
         return with_colors(points, without, photographs, source) if self.want_points else points
+
+    def _placed(self, points: Points) -> Points:
+        """Mirror points of files as the poses are."""
+        mirrored = points._replace(xyz=points.xyz @ self.mirror[:3, :3].T + self.mirror[:3, 3])
+        return mirrored if (self.mirror != np.eye(4)).any() else points
 
     def _points(self, own: Points | None, photographs: Sequence[Photograph], source: str) -> Points | None:
         """Choose the points to start from: of --ply-path, the capture's `own`, those of a PLY file beside it that shows
@@ -346,5 +349,4 @@ class _Reader:
         from bitymi_ns.capture.known_poses import triangulated  # slow to import, and seldom needed
 
         found = triangulated(photographs, folder, source)
-        read = partial(self._cloud, remedy="", photographs=photographs)
-        return (cloud_beside(folder, found, photographs, read) if auto else None) or found
+        return (cloud_beside(folder, found, photographs, self._placed) if auto else None) or found

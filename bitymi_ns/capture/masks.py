@@ -74,13 +74,6 @@ def _named(names: Sequence[str], folder: Path, forms: Sequence[str]) -> dict[str
     return found
 
 
-def read_mask(path: Path) -> Image.Image:
-    """Read a mask as a 1-bit image, True where pixels count; see `mask_pixels`. instant-ngp's are inverted. Raises
-    Pillow's errors."""
-    with open_picture(path) as image:
-        return Image.fromarray(mask_pixels(image) ^ _is_dynamic(path))
-
-
 def _is_dynamic(path: Path) -> bool:
     return path.name.lower().startswith(DYNAMIC.names.removesuffix("NAME"))
 
@@ -103,11 +96,12 @@ def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
 
 
 def checked_mask(path: Path) -> Image.Image:
-    """Read a mask, see `read_mask`. Raises CaptureError: it is missing, or cannot be read."""
+    """Read a mask as a 1-bit image, True where pixels count, see `mask_pixels`; instant-ngp's are inverted. Raises
+    CaptureError: it is missing, or cannot be read."""
     if not path.exists():
         fail(f"the mask {path} is missing")
-    with parsing(f"the mask {path}", "Replace it, or remove the masks from the capture."):
-        return read_mask(path)
+    with parsing(f"the mask {path}", "Replace it, or remove the masks from the capture."), open_picture(path) as image:
+        return Image.fromarray(mask_pixels(image) ^ _is_dynamic(path))
 
 
 def with_masks(

@@ -106,3 +106,12 @@ IMAGES_OF = (
     Kind("NAME/sparse NAME/sparse/[0-9]*", "NAME/images"),
 )
 """Folders of COLMAP models, and of the pictures that belong to them."""
+CLOUDS = (Kind("*.ply", "a point cloud", use="--ply-path"),)
+LISTS = (
+    Kind("train_list.txt", "train"),
+    Kind("val_list.txt validation_list.txt", "val"),
+    Kind("test_list.txt", "test"),
+)
+"""Lists of names of photographs, beside a COLMAP model, by split."""
+NSVF = (Kind("0_*", "train"), Kind("1_*", "val"), Kind("2_*", "test"))
+"""Names of photographs by split."""

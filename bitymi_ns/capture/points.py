@@ -12,7 +12,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from bitymi_ns.capture.folder_contents import kind_of
 from bitymi_ns.capture.image_files import read_image
+from bitymi_ns.capture.kinds import CLOUDS
 from bitymi_ns.capture.types import CaptureError, Photograph, parsing, say
 from bitymi_ns.ply import read_header, read_rows
 from bitymi_ns.ranges import spread
@@ -89,7 +91,7 @@ def cloud_beside(
     `found` by triangulation; None = none. `placed` moves points of files to the poses' world. Say why others are not
     used."""
     centers = np.stack([each.pose[:3, 3] for each in photographs])
-    for path in sorted(folder.glob("*.ply")):
+    for path in sorted(path for path in folder.iterdir() if kind_of(path, CLOUDS)):
         try:
             cloud, without = read_cloud(path, "")
         except CaptureError as error:

@@ -10,12 +10,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from bitymi_ns.capture.find_files import find_named
+from bitymi_ns.capture.folder_contents import kind_of
+from bitymi_ns.capture.kinds import LISTS, NSVF
 from bitymi_ns.capture.types import Photograph, fail, parsing, warn
 from bitymi_ns.safe_reading import read_text
 from bitymi_ns.trust import listed, told_apart
 
 Mode = Literal["fraction", "filename", "interval", "all"]
-NSVF = {"0": "train", "1": "val", "2": "test"}  # splits by the first number of NSVF's names
 
 
 class NameLists(NamedTuple):
@@ -143,8 +144,7 @@ def _names_in(path: Path, what: object) -> list[str]:
 def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLists:
     """Read the lists of names of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`; else
     3DGS's `test.txt` in the model's folder, which may name more than the photographs' `files`."""
-    of_split = (("train", "train"), ("val", "val"), ("val", "validation"), ("test", "test"))
-    stated = [(split, folder / f"{name}_list.txt") for split, name in of_split]
+    stated = [(row.what, folder / name) for row in LISTS for name in row.names.split()]
     found, test = {split: _names_in(path, path) for split, path in stated if path.is_file()}, model / "test.txt"
     if found or not test.is_file():
         return NameLists(found)
@@ -160,7 +160,8 @@ def lists_by_name(files: Sequence[Path]) -> NameLists:
     some with another."""
     found: dict[str, list[str]] = {}
     for file in files:
-        found.setdefault(NSVF.get(file.name.partition("_")[0], ""), []).append(str(file))
+        row = kind_of(file, NSVF)
+        found.setdefault("" if row is None else row.what, []).append(str(file))
     return NameLists({} if "" in found or "train" not in found or len(found) < 2 else found, "NSVF's names")
 
 

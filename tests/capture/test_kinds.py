@@ -4,12 +4,28 @@ import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from bitymi_ns.capture.folder_contents import images_of, passed_over, poses_in
-from bitymi_ns.capture.kinds import FOLDERS, IMAGES_OF, PICTURES, POSES, RENDERS, RESULTS, UNREAD, Kind
+from bitymi_ns.capture.kinds import (
+    CLOUDS,
+    FOLDERS,
+    IMAGES_OF,
+    LISTS,
+    NSVF,
+    PICTURES,
+    POSES,
+    RENDERS,
+    RESULTS,
+    UNREAD,
+    Kind,
+)
+from bitymi_ns.capture.points import Points, cloud_beside
 from bitymi_ns.capture.sfm_photos import find_photos
+from bitymi_ns.capture.splits import lists_by_name, read_split_lists
+from bitymi_ns.capture.types import ColmapCamera, Photograph
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/capture.md"
 TABLES = {
@@ -19,6 +35,8 @@ TABLES = {
     "Not read": UNREAD,
     "Poses, not read": POSES,
     "Pictures of models": IMAGES_OF,
+    "Clouds": CLOUDS,
+    "Splits": (*LISTS, *NSVF),
 }
 
 
@@ -101,3 +119,24 @@ def test_poses_of_other_programs(tmp_path: Path, row: Kind, name: str, whose: st
 @pytest.mark.parametrize(("row", "name", "whose"), list(of(IMAGES_OF)))
 def test_pictures_of_a_model(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
     assert images_of(tmp_path / name)[0] == tmp_path / row.what.replace("NAME", "img")
+
+
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(CLOUDS)))
+def test_clouds_that_nothing_names(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
+    view = Photograph(Path(), ColmapCamera("PINHOLE", 8, 8, (8.0, 8.0, 4.0, 4.0)), np.eye(4), "")
+    cloud = Points(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
+    for place in (tmp_path / "cloud.txt", tmp_path / name.upper()):
+        place.touch()
+        found = cloud_beside(tmp_path, cloud, [view], lambda path: cloud)
+    assert found is cloud
+
+
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(LISTS)))
+def test_lists_of_splits(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text("a.png\n")
+    assert read_split_lists(tmp_path, tmp_path, []).names == {row.what: ["a.png"]}
+
+
+def test_names_of_splits() -> None:
+    files = {row.what: [name] for row, name, _ in of(NSVF)}
+    assert lists_by_name([Path(*names) for names in files.values()]).names == files

@@ -99,11 +99,9 @@ def exposure_exif(image: Image.Image) -> Image.Exif:
 
 
 def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
-    """Read shutter time (seconds), f-number and ISO of an opened image; None without a time."""
-    try:
-        detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
-    except Exception:  # Pillow raises many kinds on broken EXIF
-        return None
+    """Read shutter time (seconds), f-number and ISO of an opened image; None without a time. Raises errors of Pillow's,
+    of many kinds, on broken EXIF."""
+    detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
     values = []
     for tag in EXPOSURE:
         value = detail.get(tag)

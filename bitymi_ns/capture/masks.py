@@ -44,10 +44,12 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
     return found
 
 
-def find_masks(names: Sequence[str], base: Path, masks: Path | None) -> tuple[dict[str, Path], bool]:
-    """Find the masks of photographs by their names in the folder `base`: beside them, else in the folder `masks`.
-    Return them by name, and whether they are beside."""
-    found = _named(names, base, (*MASK.names.split(), *DYNAMIC.names.split()))
+def find_masks(
+    names: Sequence[str], base: Path, masks: Path | None, stated: bool = False
+) -> tuple[dict[str, Path], bool]:
+    """Find the masks of photographs by their names in the folder `base`: beside them unless a folder is `stated`, else
+    in the folder `masks`. Return them by name, and whether they are beside."""
+    found = {} if stated else _named(names, base, (*MASK.names.split(), *DYNAMIC.names.split()))
     if found or masks is None:
         return found, bool(found)
     return _named(names, masks, ("NAME", *MASK.names.split())), False
@@ -127,7 +129,7 @@ def with_masks(
         masks = mask_folder(base, capture, None if stated is None else capture / stated, downscale)
     except CaptureError as error:
         fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
-    found, beside = find_masks(names, base, masks)
+    found, beside = find_masks(names, base, masks, stated is not None)
     missing = [name for name in names if name not in found]
     if masks and missing and not beside and (found or stated or images):
         others = ", but of others" if found else ""

@@ -57,7 +57,7 @@ def find_poses(
         where = mask_folder(folder, source, options.masks)
         if where is not None and (below := where / folder.relative_to(photo_folder(source))).is_dir():
             where = below
-        masks, _ = find_masks(names, folder, where)
+        masks, _ = find_masks(names, folder, where, options.masks is not None)
         if not masks and where is not None:
             advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out"
             raise CaptureError(f"no mask in {where} belongs to a photograph: {advice} (--use-masks False)")

@@ -14,8 +14,9 @@ from bitymi_ns.capture.colmap_views import Origin, Source
 from bitymi_ns.capture.folder_contents import photo_folder
 from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
-from bitymi_ns.capture.masks import mask_folder
+from bitymi_ns.capture.masks import find_masks, mask_folder
 from bitymi_ns.capture.recognise import Found
+from bitymi_ns.capture.sfm_photos import find_photos
 from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
 from bitymi_ns.safe_reading import read_json
@@ -49,8 +50,9 @@ def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings
 
     masks = None
     if use_masks and found.format != "video":
-        stated = None if masks_path is None else found.folder / masks_path
-        masks = mask_folder(photo_folder(found.path), found.folder, stated)
+        base, stated = photo_folder(found.path), None if masks_path is None else found.folder / masks_path
+        beside = stated is None and find_masks(find_photos(base), base, None)[0]
+        masks = None if beside else mask_folder(base, found.folder, stated)
     with rich_progress() as progress:
         options = SfmOptions(**asdict(settings), masks=masks, use_masks=use_masks)
         poses = find_poses(found.path, options, progress, warn)

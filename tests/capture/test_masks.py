@@ -81,6 +81,8 @@ def test_masks_beside_photographs_are_used_before_a_folder(tmp_path: Path, form:
         (tmp_path / name).write_bytes(b"")
     found = find_masks(["cam1/a.jpg", "cam1/b.jpg"], tmp_path / "photos", tmp_path / "masks")
     assert found == ({"cam1/a.jpg": tmp_path / name}, True)
+    found = find_masks(["cam1/a.jpg"], tmp_path / "photos", tmp_path / "masks", stated=True)
+    assert found == ({"cam1/a.jpg": tmp_path / "masks/cam1/a.png"}, False)
 
 
 def blob() -> np.ndarray:

@@ -26,6 +26,7 @@ from bitymi_ns.capture.points import Points, cloud_beside
 from bitymi_ns.capture.sfm_photos import find_photos
 from bitymi_ns.capture.splits import lists_by_name, read_split_lists
 from bitymi_ns.capture.types import ColmapCamera, Photograph
+from tests.captures import write_cloud
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/capture.md"
 TABLES = {
@@ -125,10 +126,10 @@ def test_pictures_of_a_model(row: Kind, name: str, whose: str, tmp_path: Path) -
 def test_clouds_that_nothing_names(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
     view = Photograph(Path(), ColmapCamera("PINHOLE", 8, 8, (8.0, 8.0, 4.0, 4.0)), np.eye(4), "")
     cloud = Points(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
-    for place in (tmp_path / "cloud.txt", tmp_path / name.upper()):
-        place.touch()
-        found = cloud_beside(tmp_path, cloud, [view], lambda path: cloud)
-    assert found is cloud
+    for place, used in ((tmp_path / "cloud.txt", False), (tmp_path / name.upper(), True)):
+        write_cloud(place, cloud.xyz)
+        found = cloud_beside(tmp_path, cloud, [view], lambda points: points)
+        assert (found is not None) is used
 
 
 @pytest.mark.parametrize(("row", "name", "whose"), list(of(LISTS)))

@@ -60,20 +60,22 @@ def line_of(error: BaseException) -> str | None:
     return f"{name} cannot be read or written: {cause}"
 
 
-def end_as_by_ctrl_c() -> None:
+def end_as_by_ctrl_c() -> list[int]:
     """Have the signals of batch systems and of terminals that are gone raise KeyboardInterrupt, so that what was begun
-    is removed; those that are handled or ignored stay as they are."""
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) == signal.SIG_DFL:
-                signal.signal(number, signal.default_int_handler)
+    is removed; those that are handled or ignored stay as they are. Return those that have changed."""
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    changed = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
+    for number in changed:
+        signal.signal(number, signal.default_int_handler)
+    return list(changed)
 
 
 def run(command: Callable[[], int]) -> int:
     """Run a command and return its exit status, also after exceptions that `line_of` describes.
 
     Ends silently if its output is a closed pipe, as with `| head`."""
-    end_as_by_ctrl_c()
+    changed = end_as_by_ctrl_c()
     try:
         try:
             return command()
@@ -89,6 +91,9 @@ def run(command: Callable[[], int]) -> int:
             raise
         _print_error(line)
         return INTERRUPTED if isinstance(error, KeyboardInterrupt) else 1
+    finally:
+        for number in changed:
+            signal.signal(number, signal.SIG_DFL)
 
 
 class _Output:

@@ -100,7 +100,7 @@ def _read(path: Path) -> None:
         (sfm_photos, "open_picture", lambda path: sfm_photos.read_photo(path.parent, path.name)),
         (
             known_poses,
-            "open_picture",
+            "read_image",
             lambda path: known_poses._job(["a"], [SimpleNamespace(file=path)], [], path.parent),
         ),
         (Image, "open", pictures.open_image),
@@ -138,6 +138,12 @@ def test_signals_of_others_remove_what_was_begun(how: signal.Signals, begun: str
         os.kill(process.pid, how)
         _, said = process.communicate()
     assert said == "bitymi: interrupted\n" and list(tmp_path.iterdir()) == []
+
+
+def test_a_command_leaves_the_signals_as_they_were() -> None:
+    before = [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]
+    assert exit_messages.run(lambda: 3) == 3
+    assert [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)] == before
 
 
 def test_faults_of_the_program_keep_their_traceback() -> None:

@@ -152,7 +152,9 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
     with open_regular(path) as file:
         try:
             parts = Parts(path, file)
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise BundleError(f"{path} cannot be read: {error.strerror or error}") from error
+        except ValueError as error:
             why = instead_of(path)
             raise BundleError(f"{path} is not a bundle{f': {why}' if why else f' in one file: {error}'}") from error
         yield parts

@@ -307,7 +307,9 @@ def _encode_blocks(texels: Tensor, alpha: bool) -> Tensor | None:
     """Encode decoded texels to BC7 blocks; None, with a warning, without the encoder."""
     try:
         return torch.from_numpy(bc7_blocks(texels.numpy(), LOAD_PROFILE, alpha))
-    except RuntimeError:
+    except RuntimeError as error:
+        if not isinstance(error.__cause__, ImportError):
+            raise
         warnings.warn(
             f"the texels stay decoded, {texels.numel() / 1e6:.0f} MB on the card where BC7 takes a quarter: the "
             "encoder is not installed (pip install ispc_texcomp)",

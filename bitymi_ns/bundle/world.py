@@ -42,6 +42,11 @@ class WorldEntry(Part):
         return self
 
 
+def same_frame(a: WorldEntry, b: WorldEntry) -> bool:
+    """Test if two scenes have the same frame, to a thousandth of their unit."""
+    return np.allclose(*(each.scale * np.array(each.transform) for each in (a, b)), rtol=1e-3, atol=1e-3)
+
+
 @dataclass(frozen=True)
 class World:
     """Frame of the scene: transform from the capture, x_scene = scale * (transform @ [x_capture, 1]), up, metres."""

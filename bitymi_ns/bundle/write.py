@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,9 +30,9 @@ from bitymi_ns.bundle.manifest import (
 )
 from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, encode_poster, most_bytes
-from bitymi_ns.bundle.read import Bundle, read_bundle
+from bitymi_ns.bundle.read import Bundle, read_bundle, read_manifest
 from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_fault, term_columns, to_columns
-from bitymi_ns.bundle.world import World
+from bitymi_ns.bundle.world import World, same_frame
 from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
@@ -116,9 +117,13 @@ def write_bundle(
             if notes is not None:
                 (new / NOTES).write_bytes(notes)
             try:
-                return read_bundle(new)
+                bundle = read_bundle(new)
             except BundleError as error:
                 raise BundleError(f"{folder} was not written, since it could not be read: {error}") from error
+            if notes is not None and not same_frame(read_manifest(folder).world, bundle.info.world):
+                kept = f"{folder / NOTES} is kept, and is in the frame of the earlier scene, not in this one's"
+                warnings.warn(f"{kept}: check its views, notes and crops, or remove it", stacklevel=2)
+        return bundle
     except OSError as error:
         size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
         needs = f" (it needs about {size_text(size)})" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""

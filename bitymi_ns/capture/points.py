@@ -24,6 +24,7 @@ VERTEX = "vertex"
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 """Names of color properties in PLY files."""
 COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
+COLOR_SIDE = 1000  # longer side that these are reduced to, pixels
 COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
 STEP = 0.1  # of the distance from a camera
@@ -121,7 +122,8 @@ def color_points(points: Points, photographs: Sequence[Photograph]) -> Points:
     """Color each point by the median over those of `COLOR_VIEWS` photographs that it projects into, robust to those in
     which it is hidden; grey if it projects into none."""
     chosen = [photographs[i] for i in spread(len(photographs), COLOR_VIEWS)]
-    images = [np.asarray(read_image(photograph.file).convert("RGB")) for photograph in chosen]
+    reduced = (read_image(each.file, wanted=each.camera.within(COLOR_SIDE)) for each in chosen)
+    images = [np.asarray(image.convert("RGB")) for image in reduced]
     rgb = np.full((len(points.xyz), 3), GREY, np.uint8)
     for start in range(0, len(rgb), COLOR_CHUNK):
         xyz = points.xyz[start : start + COLOR_CHUNK]

@@ -143,7 +143,7 @@ def _features(photograph: Photograph) -> Features:
     Zisserman, 2012); none if the photograph cannot be read, or not with its camera, which is reported later."""
     camera, found, mask = photograph.camera, (), None
     side = SIDE * (2 if camera.model == SPHERICAL_MODEL else 1)
-    size = tuple(max(1, round(each * min(1.0, side / max(camera.size)))) for each in camera.size)
+    size = camera.within(side)
     with suppress(CaptureError):
         image = np.asarray(read_image(photograph.file, wanted=size).convert("L"))
         if photograph.mask is not None:

@@ -82,6 +82,11 @@ class ColmapCamera(NamedTuple):
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
+    def within(self, side: int) -> tuple[int, int]:
+        """Return the size of pictures reduced to at most `side` pixels along the longer side."""
+        scale = min(1.0, side / max(self.size))
+        return max(1, round(self.width * scale)), max(1, round(self.height * scale))
+
     def rescaled(self, width: int, height: int) -> "ColmapCamera":
         """Return the camera for the same pictures in another size."""
         if (width, height) == self.size:

@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn import Parameter
 from torch.optim import Adam, Optimizer
 
+from bitymi_ns.exit_messages import out_of_memory
 from bitymi_ns.ops.backend import cuda_backend, dense, kernel_class, on_device, stream_of
 from bitymi_ns.scene.field import HashField
 
@@ -32,7 +33,9 @@ def adam(parameters: list[Parameter], betas: tuple[float, float] = BETAS, rate: 
 def _fuses(device: str) -> bool:
     try:
         Adam([torch.zeros(1, device=device)], fused=True)
-    except RuntimeError:
+    except RuntimeError as error:
+        if out_of_memory(error):
+            raise
         return False
     return True
 

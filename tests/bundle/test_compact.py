@@ -99,6 +99,13 @@ def test_many_texels_become_blocks_for_a_card_where_they_are_asked_for(tmp_path:
     with pytest.warns(UserWarning, match="pip install ispc_texcomp"):
         without = read_bundle(folder, decode=False).scene
     assert torch.equal(without.atlas, whole.atlas) and without.blocks is None
+    monkeypatch.setattr(read, "bc7_blocks", fails_for_lack_of_memory)
+    with pytest.raises(BundleError, match="needs more memory than there is"):
+        read_bundle(folder, decode=False)
+
+
+def fails_for_lack_of_memory(*_: object, **options: object) -> None:
+    raise RuntimeError("DefaultCPUAllocator: not enough memory")
 
 
 def pixels_of(tiles: torch.Tensor, atlas: torch.Tensor) -> torch.Tensor:

@@ -3,6 +3,7 @@
 import copy
 import json
 import os
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.notes import NotesError, notes_of, parse_notes
 from bitymi_ns.bundle.parts import NOTES_LIMIT, check_target
 from bitymi_ns.bundle.single import write_single
+from bitymi_ns.bundle.world import World
 from bitymi_ns.cli import main
 from tests.bundle.compact_scene import make_codes, write_compact
 
@@ -160,7 +162,12 @@ def test_a_bundle_in_one_file_has_it(folder: Path) -> None:
 
 
 def test_a_bundle_that_replaces_another_keeps_its_notes(folder: Path) -> None:
-    write_compact(folder, make_codes(count=50), overwrite=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_compact(folder, make_codes(count=50), overwrite=True)
+    assert (folder / "notes.json").read_bytes() == text()
+    with pytest.warns(UserWarning, match=r"notes\.json is kept, and is in the frame of the earlier scene"):
+        write_compact(folder, make_codes(count=50), world=World(scale=2.0), overwrite=True)
     assert (folder / "notes.json").read_bytes() == text()
     (folder / "notes.json").unlink()
     write_compact(folder, make_codes(count=50), overwrite=True)

@@ -119,7 +119,7 @@ def test_what_stands_in_the_place_of_a_mesh_is_kept(trained: BitymiTrainerConfig
     mesh_of(config, folder, format="glb")
     assert {path.name for path in folder.iterdir()} == {"notes.txt", "mesh.ply", "mesh.mtl", "mesh.glb"}
     mesh_of(config, folder, format="obj")
-    assert {path.name for path in folder.iterdir()} == {"notes.txt", "mesh.ply", "mesh.obj", "mesh.glb"}
+    assert {path.name for path in folder.iterdir()} == {"notes.txt", "mesh.ply", "mesh.mtl", "mesh.obj", "mesh.glb"}
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="file is not a folder"):
         mesh_of(config, tmp_path / "file")

@@ -132,7 +132,11 @@ def test_a_bundle_without_run_is_in_the_frame_of_its_captures_files(
 
 
 def test_a_run_whose_capture_was_moved(
-    trained: BitymiTrainerConfig, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    trained: BitymiTrainerConfig,
+    room: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     run = a_run_of(trained, tmp_path)
     rewrite(run, lambda config: setattr(config.pipeline.datamanager, "data", Path("/no/longer/there")))
@@ -144,6 +148,10 @@ def test_a_run_whose_capture_was_moved(
     monkeypatch.setenv("BITYMI_DATA", str(room))
     config, pipeline, _, _ = eval_setup(run / "config.yml")
     assert config.get_base_dir() == run and len(pipeline.datamanager.eval_dataset) == 2
+    assert "another capture" not in " ".join(capsys.readouterr().out.split())
+    monkeypatch.setenv("BITYMI_DATA", str(generate(tmp_path / "other", views=12, width=48, height=36, seed=1)))
+    eval_setup(run / "config.yml")
+    assert "The run was trained on another capture: " in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize("name", sorted(REFUSED))

@@ -93,3 +93,18 @@ def test_where_torch_has_no_fused_adam_each_steps_itself(monkeypatch: pytest.Mon
                 step(given, {})
     for a, b in zip(parameters_of(fused), parameters_of(plain), strict=True):
         torch.testing.assert_close(a, b)
+
+
+def test_a_lack_of_memory_is_no_lack_of_the_fused_form(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object, **options: object) -> None:
+        raise RuntimeError(why)
+
+    monkeypatch.setattr(module, "Adam", fails)
+    for why in ("CUDA out of memory", "`fused=True` is not supported"):
+        module._fuses.cache_clear()
+        if "memory" in why:
+            with pytest.raises(RuntimeError, match="memory"):
+                module._fuses("cpu")
+        else:
+            assert not module._fuses("cpu")
+    module._fuses.cache_clear()

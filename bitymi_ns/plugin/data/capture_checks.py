@@ -23,6 +23,7 @@ from bitymi_ns.capture.read import check_options
 from bitymi_ns.capture.recognise import Format
 from bitymi_ns.capture.transforms import HOW_TO_GET_ONE
 from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.exit_messages import line_of
 from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.views import MOVED
@@ -127,7 +128,7 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
     except (CaptureError, NameError, AssertionError):  # clear already, or no fault of the capture
         raise
     except Exception as error:
-        detail = why(error)
+        detail = (isinstance(error, OSError) and line_of(error)) or why(error)
         if isinstance(error, UnidentifiedImageError):
             detail += ". Save the photographs as PNG or JPEG"
         fail(f"{capture} cannot be loaded: {detail}", error)

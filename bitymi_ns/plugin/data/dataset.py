@@ -207,7 +207,7 @@ def capture_fingerprint(dataset: BitymiDataset) -> dict[str, Any]:
 
 
 def warn_of_other_capture(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Warn if a resumed run reads another capture, by fingerprints."""
+    """Warn if a run that is resumed, measured or exported reads another capture, by fingerprints."""
     if before["views"] != now["views"]:
         what = f"it had {before['views']} training photographs, this one has {now['views']}"
     elif before["names"] != now["names"]:
@@ -217,6 +217,6 @@ def warn_of_other_capture(before: Mapping[str, Any], now: Mapping[str, Any]) -> 
     else:
         return
     warn(
-        f"The run that is continued was trained on another capture: {what}. Photographs that are held out now may have "
-        "been trained on, and what was learned of another scene stays visible. Where that matters, train a new run."
+        f"The run was trained on another capture: {what}. Photographs that are held out now may have been trained on, "
+        "and what was learned of another scene stays visible. Where that matters, train a new run."
     )

@@ -94,8 +94,6 @@ class ExportMesh(SurfaceOptions):
         up, origin = up_of(source.world, to), torch.zeros(3) if to is None else to.origin
         self._check_target(path)
         write_file(path, mesh_bytes(mesh, self.format, up, origin, note), follow=True)
-        if self.format == "obj":  # which earlier versions wrote beside it
-            path.with_suffix(".mtl").unlink(missing_ok=True)
         parts = int(mesh.parts().max()) + 1
         counts = f"{len(mesh.vertices):,} vertices, {len(mesh):,} triangles, {parts:,} part{'s' if parts > 1 else ''}"
         say(f"{counts}, of {len(cameras)} views")

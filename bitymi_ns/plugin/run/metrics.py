@@ -52,8 +52,8 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
     """Measure NVIDIA's FLIP (LDR), mean over the image; None without its package."""
     try:
         from flip_evaluator import nbflip
-    except ImportError:
-        warn_once("FLIP is left out: its package is not installed (pip install flip-evaluator).")
+    except ImportError as error:
+        warn_once(f"FLIP is left out: {error} (pip install flip-evaluator).")
         return None
     # LDR, sRGB input, no colour map, with mean error, default viewing conditions
     pair = (reference.cpu().contiguous().numpy(), image.cpu().contiguous().numpy())

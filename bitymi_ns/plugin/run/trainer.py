@@ -24,6 +24,7 @@ from torch import Tensor
 from bitymi_ns import exit_messages, files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
+from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.hooks import filter_console, ignore_torch_warnings
 from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
@@ -226,6 +227,8 @@ class BitymiPipeline(VanillaPipeline):
         if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # in training the callbacks do this
             return
         state, held_out = self.model.resume_state, to_cameras(self.datamanager.eval_dataset.cameras, "cpu")
+        if "capture" in state:  # checkpoints of earlier versions have none
+            warn_of_other_capture(state["capture"], capture_fingerprint(self.datamanager.train_dataset))
         if (poses := state.get("poses")) is not None and poses["motions"] is not None:
             self.model.carry = self.datamanager.move_cameras(poses["motions"])
         _, found = self.datamanager.corrections(state.get("exposure"))

@@ -1,5 +1,7 @@
 """The data manager on good and bad captures."""
 
+import errno
+import os
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,6 +12,8 @@ import torch
 from PIL import Image
 
 from bitymi_ns.plugin.data import dataset
+from bitymi_ns.plugin.data.capture_checks import reporting_input_errors
+from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
 from tests.captures import edit, expect, images_of, load, printed
@@ -121,3 +125,13 @@ def test_options_that_leave_no_capture(capture: Path, options: dict[str, Any], m
     with expect(message):
         load(capture, **options)
     assert len(load(capture, eval_mode="interval", train_split_fraction=2.0).train_dataset) == 10  # unused
+
+
+def test_a_file_without_permission_is_named(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(capture / "images"))
+
+    monkeypatch.setattr(BitymiDataManagerConfig, "setup", denied)
+    with expect(f"{capture / 'images'} cannot be read or written: you have no permission for it"):
+        with reporting_input_errors(BitymiDataManagerConfig(data=capture)):
+            BitymiDataManagerConfig(data=capture).setup()

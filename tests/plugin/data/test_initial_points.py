@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from bitymi_ns.capture import known_poses
+from bitymi_ns.capture import known_poses, points
+from bitymi_ns.capture.image_files import read_image
 from bitymi_ns.capture.points import read_cloud
-from bitymi_ns.capture.types import Photograph
+from bitymi_ns.capture.types import ColmapCamera, Photograph
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.sample.capture import camera_path, render
@@ -161,6 +162,22 @@ def test_a_cloud_that_nothing_names(
     given = load_any(capture, ply_path=Path("b.ply")).train_dataparser_outputs.metadata["points3D_xyz"]
     assert len(given) == 441 and "nothing names" not in printed(capsys)
     assert len(load_any(capture, points="triangulate").train_dataparser_outputs.metadata["points3D_xyz"]) == 2
+
+
+def test_photographs_that_color_points_are_read_reduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    Image.new("RGB", (1600, 1200), (10, 200, 30)).save(tmp_path / "a.jpg")
+    sizes: list[Any] = []
+
+    def read(path: Path, **how: Any) -> Image.Image:
+        sizes.append(read_image(path, **how).size)
+        return read_image(path, **how)
+
+    monkeypatch.setattr(points, "read_image", read)
+    camera = ColmapCamera("PINHOLE", 1600, 1200, (800.0, 800.0, 800.0, 600.0))
+    ahead = points.Points(np.array([[0.0, 0.0, -2.0], [0.1, 0.9, -2.0], [0.0, 0.0, 2.0]]), np.zeros((0, 3), np.uint8))
+    found = points.color_points(ahead, [Photograph(tmp_path / "a.jpg", camera, np.eye(4), "a")]).rgb
+    assert sizes == [(1000, 750)] and np.abs(found[:2].astype(int) - (10, 200, 30)).max() < 4
+    assert (found[2] == points.GREY).all()
 
 
 def test_points_without_colors_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -141,24 +141,21 @@ def generate(
     output_dir = Path(output_dir).absolute()
 
     def check() -> None:
-        made = _files_of(output_dir) if _is_sample(output_dir) else None
-        check_replaceable(output_dir, "a sample capture", made, overwrite, FileExistsError)
+        check_replaceable(output_dir, "a sample capture", _files_of(output_dir), overwrite, FileExistsError)
 
     with complete_folder(output_dir, check) as new:
         _write(new, views, width, height, seed, points, progress)
     return output_dir
 
 
-def _is_sample(folder: Path) -> bool:
+def _files_of(folder: Path) -> list[str] | None:
+    """List the files of a sample; None: the folder is none."""
     try:
-        return read_json(folder / CAPTURE).get("made_by") == MADE_BY
+        made_by = read_json(folder / CAPTURE).get("made_by")
     except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
-        return False
-
-
-def _files_of(folder: Path) -> list[str]:
+        return None
     images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
-    return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)]
+    return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)] if made_by == MADE_BY else None
 
 
 def _write(folder: Path, views: int, width: int, height: int, seed: int, points: int, progress: bool) -> None:
@@ -183,14 +180,8 @@ def _write(folder: Path, views: int, width: int, height: int, seed: int, points:
                 raise
     write_cloud(folder / CLOUD, *sparse_points(room, path, images, points, seed))
     meta = {
-        "made_by": MADE_BY,
-        "camera_model": "OPENCV",
-        "w": width,
-        "h": height,
-        "fl_x": FOCAL * width,
-        "fl_y": FOCAL * width,
-        "cx": width / 2,
-        "cy": height / 2,
+        **{"made_by": MADE_BY, "camera_model": "OPENCV", "w": width, "h": height},
+        **{"fl_x": FOCAL * width, "fl_y": FOCAL * width, "cx": width / 2, "cy": height / 2},
         **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
         "ply_file_path": CLOUD,
         "frames": [

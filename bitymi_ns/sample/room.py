@@ -20,8 +20,6 @@ OUTSIDE = (-40.0, 40.0, -5.0, 15.0)  # x0, x1, z0, z1 of the landscape image
 OUTSIDE_Y = 30.0
 LAMP = (-0.6, 0.9, -0.7, 0.1)  # x0, x1, y0, y1 of the light in the ceiling
 
-SPHERE_CENTRE, SPHERE_RADIUS = np.float32([-0.55, 0.10, 0.80]), np.float32(0.36)
-KNOB_CENTRE, KNOB_RADIUS = np.float32([1.25, -0.95, 1.37]), np.float32(0.07)
 BOX_CENTRE, BOX_HALF, BOX_YAW = np.float32([0.65, -0.05, 0.38]), np.float32([0.32, 0.26, 0.38]), np.float32(0.5)
 PLINTH = (np.float32([-0.85, -0.20, 0.0]), np.float32([-0.25, 0.40, 0.44]))
 POLES = [(1.55, 0.95, 0.022, 2.6), (1.25, -0.95, 0.012, 1.35), (-1.45, -0.85, 0.016, 1.7)]  # x, y, radius, height
@@ -30,29 +28,25 @@ UPRIGHTS, RUNGS = 8, 7  # thin bars of the lattice behind the sphere
 
 # Surfaces. 0 to 5 are the room's sides: x low, x high, y low, y high, floor, ceiling.
 LANDSCAPE, SPHERE, BOX, PLINTH_ID, BARS, POLE, KNOB = range(6, 13)
+SIDE_AXES = ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))
+"""World axes of the normal of a side, of its texture's u and of its v."""
+BALLS = {
+    SPHERE: (np.float32([-0.55, 0.10, 0.80]), np.float32(0.36), (0.16, 0.20, 0.30), 0.55),
+    KNOB: (np.float32([1.25, -0.95, 1.37]), np.float32(0.07), (0.85, 0.15, 0.10), 0.0),
+}
+"""Centre, radius, colour and gloss."""
 DISTANT = np.float32(1e9)
 NEAR = np.float32(1e-4)
 
 
 def _bars() -> tuple[np.ndarray, np.ndarray]:
     """Build the corners (low, high), each [m, 3], of the bars: a free-standing lattice and the window's cross."""
-    low, high = [], []
-
-    def add(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> None:
-        low.append((x0, y0, z0))
-        high.append((x1, y1, z1))
-
-    for k in range(UPRIGHTS):
-        x = -1.75 + 0.17 * k
-        add(x, x + 0.014, 1.000, 1.014, 0.0, 1.35)
-    for k in range(RUNGS):
-        z = 0.12 + 0.19 * k
-        add(-1.80, -0.50, 1.014, 1.026, z, z + 0.012)
-    x0, x1, z0, z1 = WINDOW
-    y = float(HIGH[1])
-    add((x0 + x1) / 2 - 0.02, (x0 + x1) / 2 + 0.02, y - 0.03, y, z0, z1)
-    add(x0, x1, y - 0.03, y, (z0 + z1) / 2 - 0.015, (z0 + z1) / 2 + 0.015)
-    return np.float32(low), np.float32(high)
+    bars = [(x, x + 0.014, 1.000, 1.014, 0.0, 1.35) for x in (-1.75 + 0.17 * k for k in range(UPRIGHTS))]
+    bars += [(-1.80, -0.50, 1.014, 1.026, z, z + 0.012) for z in (0.12 + 0.19 * k for k in range(RUNGS))]
+    (x0, x1, z0, z1), y = WINDOW, float(HIGH[1])
+    bars.append(((x0 + x1) / 2 - 0.02, (x0 + x1) / 2 + 0.02, y - 0.03, y, z0, z1))
+    bars.append((x0, x1, y - 0.03, y, (z0 + z1) / 2 - 0.015, (z0 + z1) / 2 + 0.015))
+    return np.float32(bars)[:, ::2], np.float32(bars)[:, 1::2]
 
 
 @dataclass
@@ -167,8 +161,8 @@ class Room:
     def _objects(self, o: Vec, d: Vec, hits: RoomHits) -> None:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = tuple(np.float32(1) / a for a in d)
-            self._hit_sphere(o, d, inverse, hits, SPHERE_CENTRE, SPHERE_RADIUS, SPHERE)
-            self._hit_sphere(o, d, inverse, hits, KNOB_CENTRE, KNOB_RADIUS, KNOB)
+            for surface in BALLS:
+                self._hit_ball(o, d, inverse, hits, surface)
             self._hit_box(o, d, inverse, hits)
             self._hit_boxes(o, inverse, hits, PLINTH_ID, PLINTH[0][None], PLINTH[1][None])
             for part, pole in enumerate(POLES):
@@ -176,9 +170,8 @@ class Room:
             for first, last in ((0, UPRIGHTS + RUNGS), (UPRIGHTS + RUNGS, len(self.bars_low))):
                 self._hit_boxes(o, inverse, hits, BARS, self.bars_low[first:last], self.bars_high[first:last], first)
 
-    def _hit_sphere(
-        self, o: Vec, d: Vec, inverse: Vec, hits: RoomHits, centre: np.ndarray, radius: np.float32, surface: int
-    ) -> None:
+    def _hit_ball(self, o: Vec, d: Vec, inverse: Vec, hits: RoomHits, surface: int) -> None:
+        centre, radius, *_ = BALLS[surface]
         index = hits.candidates(o, inverse, centre - radius, centre + radius)
         o, d = _take(o, index), _take(d, index)
         oc = tuple(o[a] - centre[a] for a in range(3))
@@ -217,16 +210,10 @@ class Room:
     def hit(self, o: Vec, d: Vec) -> RoomHits:
         """Compute the first hits of rays that start inside the room."""
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            exits = []
-            for a in range(3):
-                t = (np.where(d[a] > 0, HIGH[a], LOW[a]) - o[a]) / d[a]
-                exits.append(np.where(d[a] == 0, DISTANT, t).astype(np.float32))
-        t = np.minimum(np.minimum(exits[0], exits[1]), exits[2])
-        surface = np.where(
-            t == exits[0],
-            np.where(d[0] > 0, 1, 0),
-            np.where(t == exits[1], np.where(d[1] > 0, 3, 2), np.where(d[2] > 0, 5, 4)),
-        ).astype(np.int8)
+            exits = [(np.where(d[a] > 0, HIGH[a], LOW[a]) - o[a]) / d[a] for a in range(3)]
+            exits = [np.where(d[a] == 0, DISTANT, exits[a]).astype(np.float32) for a in range(3)]
+        axis, t = np.argmin(exits, axis=0), np.min(exits, axis=0)
+        surface = (2 * axis + (np.choose(axis, d) > 0)).astype(np.int8)
         hits = RoomHits(t, surface, np.zeros(t.shape, np.int8))
         index = np.flatnonzero(surface == 3)
         if len(index):
@@ -261,12 +248,10 @@ class Room:
         """Compute colors [n, 3] of points p [n] on one object, viewed along d [n]."""
         n = p[0].shape[0]
         gloss = 0.0
-        if surface in (SPHERE, KNOB):
-            centre, radius = (SPHERE_CENTRE, SPHERE_RADIUS) if surface == SPHERE else (KNOB_CENTRE, KNOB_RADIUS)
+        if surface in BALLS:
+            centre, radius, rgb, gloss = BALLS[surface]
             normal = tuple((p[a] - centre[a]) / radius for a in range(3))
-            rgb = (0.16, 0.20, 0.30) if surface == SPHERE else (0.85, 0.15, 0.10)
             base = np.broadcast_to(np.float32(rgb), (n, 3))
-            gloss = 0.55 if surface == SPHERE else 0.0
         elif surface == BOX:
             normal, u, v = _box_face(p)
             base, gloss = textures.lookup(self.box_texture, u, v), 0.10
@@ -327,14 +312,9 @@ def _box_face(p: Vec) -> tuple[Vec, Image, Image]:
     return (c * nx - s * ny, s * nx + c * ny, nz), u, v
 
 
-def _side_axes(side: int) -> tuple[int, int, int]:
-    """Return the world axes of the side's normal, of its texture's u and of its v."""
-    return ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))[side]
-
-
 def _side_uv(side: int, p: Vec) -> tuple[Image, Image]:
     """Compute texture coordinates in [0, 1]; u points right for a viewer inside the room."""
-    _, ua, va = _side_axes(side)
+    _, ua, va = SIDE_AXES[side]
     u = (p[ua] - LOW[ua]) / (HIGH[ua] - LOW[ua])
     if side in (1, 2):
         u = 1 - u
@@ -343,14 +323,14 @@ def _side_uv(side: int, p: Vec) -> tuple[Image, Image]:
 
 def _side_points(side: int, u: Image, v: Image) -> tuple[Vec, np.ndarray]:
     """Compute world points [n] at texture coordinates, and the side's inward normal [3]."""
-    na, ua, va = _side_axes(side)
+    na, ua, va = SIDE_AXES[side]
     if side in (1, 2):
         u = 1 - u
     p: list[Image] = [u, u, u]
     p[ua] = LOW[ua] + u * (HIGH[ua] - LOW[ua])
     p[va] = LOW[va] + v * (HIGH[va] - LOW[va])
-    inward = 1.0 if side % 2 == 0 else -1.0
-    p[na] = np.full_like(u, (LOW if side % 2 == 0 else HIGH)[na] + np.float32(1e-3 * inward))
+    wall, inward = (LOW, 1.0) if side % 2 == 0 else (HIGH, -1.0)
+    p[na] = np.full_like(u, wall[na] + np.float32(1e-3 * inward))
     normal = np.zeros(3, np.float32)
     normal[na] = inward
     return (p[0], p[1], p[2]), normal

@@ -41,23 +41,18 @@ def grid(width_m: float, height_m: float) -> tuple[Image, Image]:
     """Compute metric coordinates (x, y), each [h, w], of the texel centres of a surface."""
     w = max(2, round(width_m * TEXELS_PER_METRE))
     h = max(2, round(height_m * TEXELS_PER_METRE))
-    y, x = np.meshgrid(
-        (np.arange(h, dtype=np.float32) + 0.5) * np.float32(height_m / h),
-        (np.arange(w, dtype=np.float32) + 0.5) * np.float32(width_m / w),
-        indexing="ij",
-    )
-    return x, y
+    x = (np.arange(w, dtype=np.float32) + 0.5) * np.float32(width_m / w)
+    y = (np.arange(h, dtype=np.float32) + 0.5) * np.float32(height_m / h)
+    return tuple(np.meshgrid(x, y))
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int = 4) -> Image:
     """Generate fractal value noise [h, w] of about [0, 1]; `cells` are rows and columns of the coarsest octave."""
     total = np.zeros(shape, np.float32)
-    weight = 0.0
     for octave in range(octaves):
         rows, columns = cells[0] * 2**octave + 1, cells[1] * 2**octave + 1
         total += 0.5**octave * resize(rng.random((rows, columns), dtype=np.float32), *shape)
-        weight += 0.5**octave
-    return total / np.float32(weight)
+    return total / np.float32(2 - 0.5 ** (octaves - 1))
 
 
 def mix(a: Image | tuple[float, ...], b: Image | tuple[float, ...], t: Image) -> Image:
@@ -148,12 +143,10 @@ def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str)
         n = noise(rng, x.shape, (4, 5), 6)
         vein = np.abs(np.sin(18 * n + 3 * x))
         image = mix(mix((0.05, 0.30, 0.28), (0.85, 0.30, 0.20), n), (0.98, 0.93, 0.80), vein**6)
-    elif kind == "bars":
+    else:
         colors = rng.random((24, 3), dtype=np.float32)
         image = colors[(x / width_m * 24).astype(int).clip(0, 23)]
         image = np.where(((y / height_m * 10).astype(int) % 2 == 0)[..., None], image, 1 - image)
-    else:
-        raise ValueError(f"unknown poster {kind!r}")
     frame = np.minimum(np.minimum(x, width_m - x), np.minimum(y, height_m - y)) < 0.025
     return np.where(frame[..., None], np.float32([0.10, 0.08, 0.07]), image).astype(np.float32)
 
@@ -189,9 +182,6 @@ def landscape(rng: np.random.Generator) -> Image:
         image[y : y + s, x : x + int(1.4 * s)] = rng.uniform(0.6, 0.95, 3)
         image[y + s : y + s + s // 3, x - 3 : x + int(1.4 * s) + 3] = (0.55, 0.18, 0.12)
         for k in range(3):
-            image[y + s // 3 : y + 2 * s // 3, x + 4 + k * (s // 2) : x + 4 + k * (s // 2) + s // 5] = (
-                0.12,
-                0.14,
-                0.20,
-            )
+            left = x + 4 + k * (s // 2)
+            image[y + s // 3 : y + 2 * s // 3, left : left + s // 5] = (0.12, 0.14, 0.20)
     return image.clip(0, 1).astype(np.float32)

@@ -9,7 +9,7 @@ from PIL import Image
 
 from bitymi_ns.sample import generate
 from bitymi_ns.sample.capture import camera_path, first_hits, look_at
-from bitymi_ns.sample.room import HIGH, LANDSCAPE, LOW, SPHERE, SPHERE_CENTRE, SPHERE_RADIUS, Room
+from bitymi_ns.sample.room import BALLS, HIGH, LANDSCAPE, LOW, SPHERE, Room
 
 VIEWS, WIDTH, HEIGHT = 12, 160, 120
 
@@ -117,7 +117,8 @@ def test_sphere_mirrors() -> None:
 
     a, b = [-1.5, -1.8, 1.2], [0.6, -1.9, 0.9]
     angles = np.linspace(-0.5, 1.3, 12)
-    on_sphere = SPHERE_CENTRE + SPHERE_RADIUS * np.stack([0 * angles, -np.cos(angles), np.sin(angles)], axis=1)
+    centre, radius, *_ = BALLS[SPHERE]
+    on_sphere = centre + radius * np.stack([0 * angles, -np.cos(angles), np.sin(angles)], axis=1)
     assert np.mean([np.abs(seen(a, p) - seen(b, p)).max() for p in on_sphere]) > 0.08
     on_floor = np.array([0.3, -1.5, 0.0])
     assert np.abs(seen(a, on_floor) - seen(b, on_floor)).max() < 0.01

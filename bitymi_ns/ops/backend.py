@@ -107,34 +107,25 @@ def module(device: torch.device) -> ModuleType:
     return load("_cpu")
 
 
-def require(operation: str, kind: str, device: torch.device, instead: str) -> None:
-    """Check that an operation has kernels for a device.
-
-    Args:
-        kind: cpu or cuda, the one with kernels.
-        instead: advice, the end of the message.
-
-    Raises:
-        RuntimeError: the device is of the other kind.
-    """
-    if cuda_backend(device) != (kind == "cuda") or device.type not in ("cpu", "cuda"):
-        where = {"cpu": "on the CPU", "cuda": "on a CUDA device"}
-        raise RuntimeError(f"{operation} runs {where[kind]} only, and the tensors are on '{device}': {instead}")
+def lookup(name: str, device: torch.device) -> Any:
+    """Return a function or class of the kernel module for a device by name. Raises RuntimeError: the kernels for that
+    device are not built, or lack it."""
+    found = getattr(module(device), name, None)
+    if found is None:
+        raise RuntimeError(f"there is no kernel {name} for tensors on '{device}': move them to another device")
+    return found
 
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:
-    """Return a kernel function by name. It takes keyword arguments (csrc/ops) and, on a CUDA device, runs on torch's
-    current stream of that device. Raises RuntimeError: the kernels for that device are not built, or lack the
-    function."""
-    compiled = getattr(module(device), name, None)
-    if compiled is None:
-        raise RuntimeError(f"there is no kernel {name} for tensors on '{device}': move them to another device")
+    """Return a kernel function by name; raises as `lookup`. It takes keyword arguments (csrc/ops) and, on a CUDA
+    device, runs on torch's current stream of that device."""
+    run = lookup(name, device)
     if device.type != "cuda":
-        return compiled
+        return run
 
     def on_stream(**arguments: Any) -> Any:
         with on_device(device):
-            return compiled(**arguments, stream=stream_of(device))
+            return run(**arguments, stream=stream_of(device))
 
     return on_stream
 
@@ -163,12 +154,12 @@ def kernel(name: str, like: Tensor) -> Callable[..., Any]:
 
 def kernel_class(name: str, like: Tensor) -> type:
     """Return the class `name` of the kernel module for tensors like `like`; raises as `kernel`."""
-    return getattr(module(like.device), _name(name, like))
+    return lookup(_name(name, like), like.device)
 
 
 def workspace(name: str, like: Tensor, **sizes: int) -> Tensor:
     """Allocate working memory for the CUDA kernel `name`: [bytes] uint8, sized by its function `name`_workspace."""
-    ask = getattr(module(like.device), _name(f"{name}_workspace", like))
+    ask = lookup(_name(f"{name}_workspace", like), like.device)
     with on_device(like.device):
         size = ask(**sizes)
     return torch.empty(size, dtype=torch.uint8, device=like.device)

@@ -6,14 +6,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import kernel, module, require
+from .backend import kernel, lookup
 from .baked_scene import BakedSceneLike, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
 from .project import GEOMETRY, CameraLike, project
 from .trace_cpu import tile_lists
 from .view_color import view_color
 
-ON_CUDA = "move the scene to the CPU, or draw with `baked.draw`"
 CHANNELS = {"rgb": slice(0, 3), "alpha": slice(3, 4), "beta": slice(4, 5), "depth": slice(5, 6), "normal": slice(6, 9)}
 """Channels of a frame by image; without maps only the first two."""
 
@@ -27,12 +26,11 @@ def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
 
     Raises:
         ValueError: the tile of a surfel lies outside its page.
-        RuntimeError: the tiles are not on the CPU.
     """
-    require("baked_cpu.gather", "cpu", tiles.device, ON_CUDA)
     layers, height, width = (0, 0, 0) if atlas is None else atlas.shape[:3]
     texels = {} if atlas is None else {"bytes" if atlas.dtype == torch.uint8 else "floats": atlas}
-    return module(tiles.device).Patches(**texels, layers=layers, height=height, width=width, tiles=tiles.contiguous())
+    patches = lookup("Patches", tiles.device)
+    return patches(**texels, layers=layers, height=height, width=width, tiles=tiles.contiguous())
 
 
 def coarser(atlas: Tensor, tiles: Tensor, alpha: bool) -> dict[str, Any]:
@@ -57,9 +55,7 @@ def frame(
 
     Raises:
         ValueError: the atlas exists only as BC7 blocks.
-        RuntimeError: the scene is not on the CPU.
     """
-    require("baked_cpu.frame", "cpu", scene.tiles.device, ON_CUDA)
     atlas, tiles, p = scene.atlas, scene.tiles, scene.surfels
     if atlas is None and scene.blocks is not None:
         raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
@@ -97,7 +93,6 @@ def draw(
     photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
     """Draw views one by one; see `baked.draw`."""
-    require("baked_cpu.draw", "cpu", scene.tiles.device, ON_CUDA)
     check_images(images, on_cuda=False)
     common_size(cameras)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}

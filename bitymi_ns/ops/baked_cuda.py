@@ -11,14 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .backend import function, module, on_device, require
+from .backend import function, lookup, module, on_device
 from .baked_scene import IMAGES, LEVELS, BakedSceneLike, check_images, common_size, decode_bc7, residual
 from .constants import TILE
 from .project import GEOMETRY, CameraLike
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
-
-ON_CPU = "move the scene there, or draw with `baked.draw`"
 
 
 class Stage(IntFlag):
@@ -32,7 +30,7 @@ class Stage(IntFlag):
 def draws_blocks(device: torch.device) -> bool:
     """Return True if the texture unit of a CUDA device decodes BC7 blocks, tested by drawing some."""
     with on_device(device):
-        return module(device).draws_bc7()
+        return lookup("draws_bc7", device)()
 
 
 def decoded(blocks: Tensor) -> Tensor:
@@ -81,11 +79,10 @@ class AtlasTexture:
 
     Raises:
         ValueError: more texels than a texture can have.
-        RuntimeError: not enough memory, BC7 is not supported, or not a CUDA device.
+        RuntimeError: not enough memory, or BC7 is not supported.
     """
 
     def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
-        require("baked_cuda.AtlasTexture", "cuda", device, ON_CPU)
         side, self._device = 4 if blocks else 1, device
         self.size = (side * texels.shape[0], side * texels.shape[1])  # height and width in texels
         self._bytes = texels.dtype == torch.uint8
@@ -93,7 +90,7 @@ class AtlasTexture:
         name = "bc7" if blocks else "uint8" if self._bytes else "half"
         height, width = self.size
         with on_device(device):
-            self.texture = module(device).AtlasTexture(
+            self.texture = lookup("AtlasTexture", device)(
                 format=name, texels=stored.contiguous().view(torch.uint8), height=height, width=width
             )
 
@@ -148,10 +145,8 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
     Raises:
         TypeError: the surfels are not float32.
         ValueError: a parameter of the view colour has a wrong shape.
-        RuntimeError: the scene is not on a CUDA device.
     """
     device = scene.tiles.device
-    require("baked_cuda.compiled", "cuda", device, ON_CPU)
     for name, value in scene.surfels.items():
         if value.dtype != torch.float32 and name != "view_span":
             raise TypeError(f"the CUDA renderer takes float32 surfels, but {name} is {value.dtype}")
@@ -175,7 +170,7 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
             levels = scene.cache.coarser(lambda: kept.levels(scene.alpha_scale > 0))
             atlas |= {name: level.texture for name, level in levels.items()}
     with on_device(device):
-        return module(device).BakedScene(
+        return lookup("BakedScene", device)(
             **{name: p[name] for name in GEOMETRY},
             **colors,
             **residual(scene),
@@ -204,13 +199,9 @@ class Workspace:
         capacity: pairs of surfel and screen tile that fit, for any distribution over the tiles.
         slots: per tile; 0 before the first frame.
         memory: [bytes] uint8; None before the first frame.
-
-    Raises:
-        RuntimeError: not a CUDA device.
     """
 
     def __init__(self, device: torch.device) -> None:
-        require("baked_cuda.Workspace", "cuda", device, ON_CPU)
         self._device = device
         self.capacity = self.slots = 0
         self.memory: Tensor | None = None
@@ -297,9 +288,7 @@ def frame(
 
     Raises:
         ValueError: wrong shape, or the workspace is too small.
-        RuntimeError: the views are not on a CUDA device.
     """
-    require("baked_cuda.frame", "cuda", viewmats.device, ON_CPU)
     _, height, width, _ = next(iter(images.values())).shape
     function("baked_frame", viewmats.device)(
         **images,
@@ -326,7 +315,6 @@ def draw(
 ) -> dict[str, Tensor]:
     """Draw views in one batch; see `baked.draw`. Waits for the images, to check that the working memory sufficed."""
     device, n = scene.tiles.device, len(scene.tiles)
-    require("baked_cuda.draw", "cuda", device, ON_CPU)
     viewmats, Ks, width, height = stack_cameras(cameras, device)
     arrays = compiled(scene, photo_pixel)
     if background is not None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import kernel, require, workspace
+from .backend import kernel, workspace
 from .constants import TILE
 from .project import CameraLike, Projection
 
@@ -43,7 +43,6 @@ def check_pair_count(pairs: int, camera: CameraLike) -> None:
 def tile_lists(geom: Tensor, projection: Projection) -> Bins:
     """List the pairs of surfel and tile of a view; waits once for their number. Raises RuntimeError: 2^31 pairs or
     more."""
-    require("bin_cuda.tile_lists", "cuda", geom.device, "call `trace`")
     camera, n, view = projection.camera, geom.shape[0], projection.view(geom)
     tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
     ranks = {"order": int32s(geom, n), "slot_start": int64s(geom, n + 1)}

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, on_same_device, require, workspace
+from .backend import dense, kernel, on_same_device, workspace
 from .constants import IMAGE_CHANNELS
 from .project import Projection
 
@@ -109,7 +109,6 @@ def picture_losses(
         ValueError: shapes or devices do not agree.
         RuntimeError: the tensors are not on a CUDA device.
     """
-    require("picture_losses", "cuda", image.device, "call `train.losses.objective`")
     if image.dim() != 3 or image.shape[-1] != IMAGE_CHANNELS:
         raise ValueError(f"the picture is {list(image.shape)}, not [H, W, {IMAGE_CHANNELS}]")
     photograph = PhotographTarget(target, mask, None, ssim_weight, falloff_weight, gamma)
@@ -138,7 +137,6 @@ def accumulate_statistics(
         RuntimeError: the tensors are not on a CUDA device.
     """
     radii = projection.radii
-    require("accumulate_statistics", "cuda", radii.device, "call `Strategy.accumulate`")
     grads = {"grad": projection.mean2d_grad, "absgrad": projection.mean2d_absgrad}
     kernel("accumulate_statistics", radii)(
         radii=radii,

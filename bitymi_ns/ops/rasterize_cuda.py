@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from .backend import cuda_backend, dense, kernel, module, require
+from .backend import cuda_backend, dense, kernel, module
 from .bands import fitting_lists
 from .bin_cuda import tile_lists
 from .blend import checked_texels
@@ -143,7 +143,6 @@ def rasterize_image(
             or tensors are on different devices.
     """
     geom = projection.geom
-    require("rasterize_image", "cuda", geom.device, "call `trace` and `blended_image`")
     texels, tiles, move_surfels, descent = checked_texels(
         geom, len(geom), base, texels, tiles, move_surfels, descent, projection.alpha
     )

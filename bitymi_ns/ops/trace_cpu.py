@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .backend import Pool, function, kernel, kernel_class, module, require
+from .backend import Pool, function, kernel, kernel_class, module
 from .capacity import TooManyFragments
 from .fragment_list import Layout, empty_ids, empty_list
 from .project import Projection
@@ -41,9 +41,7 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 
     Raises:
         TooManyFragments: there are more than `most`.
-        RuntimeError: the tensors are not on the CPU.
     """
-    require("trace_cpu.find_fragments", "cpu", geom.device, "call `trace`")
     most = MOST if most == 0 else most or 0
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), **projection.alpha_arrays, most=most)
@@ -95,6 +93,5 @@ def count(projection: Projection) -> int:
     """Count the fragments of a view on the CPU without making their list. Raises RuntimeError: the projection is not on
     the CPU."""
     geom = projection.geom.detach()
-    require("trace_cpu.count", "cpu", geom.device, "count those of `trace`")
     with tracers(geom).borrow() as tracer:
         return tracer.run(**projection.view(geom), **projection.alpha_arrays, most=1)

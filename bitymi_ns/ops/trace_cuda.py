@@ -7,7 +7,7 @@ the fragments. Images without lists need the first only (rasterize_cuda.py).
 import torch
 from torch import Tensor
 
-from .backend import function, kernel, module, on_device, require, workspace
+from .backend import function, kernel, module, on_device, workspace
 from .bin_cuda import Bins, int32s, int64s, tile_lists
 from .capacity import TooManyFragments, check_capacity, fragment_capacity
 from .fragment_list import Layout, empty_ids, empty_list
@@ -17,7 +17,6 @@ from .project import Projection
 def blended(geom: Tensor, projection: Projection, bins: Bins) -> Layout:
     """Mark the pixels where each pair blends: returns the layout of the fragment list, surfels and pixels unwritten.
     Waits once for the number of fragments."""
-    require("trace_cuda.blended", "cuda", geom.device, "call `trace`")
     camera, pairs = projection.camera, bins.surfel.shape[0]
     marks = {"masks": int32s(geom, module(geom.device).TILE_WARPS, pairs), "offsets": int64s(geom, pairs + 1)}
     kernel("trace_mark", geom)(

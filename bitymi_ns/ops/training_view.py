@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, kernel_class, module, on_device, require, stream_of, workspace
+from .backend import dense, kernel, kernel_class, module, on_device, stream_of, workspace
 from .bin_cuda import check_pair_count
 from .blend import checked_texels
 from .constants import FRAME, GEOM
@@ -173,7 +173,6 @@ def training_view(
         RuntimeError: 2^31 pairs of surfel and tile or more, or not a CUDA device.
         ValueError: as `project`, `view_color`, `picture_losses` and `blended_image`.
     """
-    require("training_view", "cuda", surfels["means"].device, "call `Scene.render` and `train.losses.objective`")
     geometry = checked_geometry(*(surfels[name] for name in GEOMETRY), camera)
     means = geometry[0]
     check_view_color(kind, surfels, len(means))

@@ -349,10 +349,6 @@ Command = (
 
 def main(args: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Errors that the user can correct print one line, no traceback."""
-    return exit_messages.run(lambda: _run(args))
-
-
-def _run(args: Sequence[str] | None) -> int:
     command = tyro.cli(
         tyro.conf.OmitSubcommandPrefixes[Command],
         prog="bitymi",
@@ -369,7 +365,3 @@ def _run(args: Sequence[str] | None) -> int:
     except (ValueError, OSError, KernelsUnavailable) as error:
         say(f"bitymi: {exit_messages.line_of(error) or error}", sys.stderr)
         return 1
-
-
-if __name__ == "__main__":
-    sys.exit(main())

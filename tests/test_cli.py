@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from bitymi_ns import cli
+from bitymi_ns import __main__, cli
 
 
 def test_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -71,7 +71,8 @@ def test_a_full_disk_and_ctrl_c_are_named(
         raise problem
 
     monkeypatch.setattr("bitymi_ns.sample.generate", failing)
-    assert cli.main(["sample", "--output-dir", str(tmp_path / "room")]) == status
+    monkeypatch.setattr("sys.argv", ["bitymi", "sample", "--output-dir", str(tmp_path / "room")])
+    assert __main__.main() == status
     assert error.format(tmp_path / "room") in capsys.readouterr().err
 
 

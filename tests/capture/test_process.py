@@ -18,7 +18,7 @@ from bitymi_ns.capture.sfm.job import Job
 from bitymi_ns.capture.sfm.process import rows
 
 Copy = Callable[[str], Path]
-COMMAND = [sys.executable, "-m", "bitymi_ns.cli", "sfm"]
+COMMAND = [sys.executable, "-m", "bitymi_ns", "sfm"]
 
 
 def database(folder: Path) -> Path | None:

@@ -256,7 +256,7 @@ def test_a_bundle_in_one_file_is_sent_and_exported_as_its_parts(bundle: Path, tm
 
 
 def test_the_command_says_where_and_ends_with_ctrl_c(bundle: Path) -> None:
-    command = [sys.executable, "-m", "bitymi_ns.cli", "view", str(bundle), "--no-open-browser"]
+    command = [sys.executable, "-m", "bitymi_ns", "view", str(bundle), "--no-open-browser"]
     # background jobs of a shell ignore Ctrl-C
     heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=heeds) as process:

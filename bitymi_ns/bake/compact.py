@@ -74,15 +74,6 @@ class Compact:
             raise ValueError(f"a bundle of {megabytes:g} MB leaves no bytes for the scene: other files take {beside:,}")
         return replace(self, most_bytes=size - beside)
 
-    def check(self) -> None:
-        """Check the values; raise ValueError for one out of range."""
-        if self.views < 1:
-            raise ValueError(f"at least 1 view must be drawn, not {self.views}")
-        if not 0 < self.share < 1:
-            raise ValueError(f"the share of the error must lie between 0 and 1, not at {self.share}")
-        if self.most_bytes is not None and self.psnr is not None:
-            raise ValueError("bytes and PSNR cannot be asked for together")
-
 
 @dataclass(frozen=True)
 class RatePoint:
@@ -124,7 +115,6 @@ class Coder:
             background: [3] colour behind the scene.
             held_out: views on which alternatives are stated; without any the training views.
         """
-        options.check()
         self._baked, self._pictures = baked, Pictures(views, background, options.views, device)
         self._held_out = Pictures(held_out, background, options.views, device)
         scene = baked.unquantised()
@@ -207,7 +197,7 @@ def compacted(
         baked, views, background, held_out: as in `Coder`.
 
     Raises:
-        ValueError: an option is out of range, or the target cannot be reached.
+        ValueError: the target cannot be reached.
     """
     options = options or Compact()
     return choose(Coder(baked, views, background, options, progress, device, held_out), options, progress)

@@ -50,13 +50,6 @@ class TexelCodeOptions:
     limit."""
     fill: bool = False  # the step also shrinks during fine-tuning, until nearly `most_bytes` are used
 
-    def check(self) -> None:
-        """Check the values."""
-        if not 0.01 <= self.step <= 1000:
-            raise ValueError(f"the step of the texels must be from 0.01 to 1000, not {self.step}")
-        if self.most_bytes is not None and self.most_bytes < 1:
-            raise ValueError(f"no bytes are left for the texels ({self.most_bytes}): ask for more")
-
 
 @dataclass(frozen=True)
 class Blocks:
@@ -224,7 +217,6 @@ class TexelCoder:
                 blending weight times the bilinear weight. A texel error e adds weight times e^2 to the pictures.
             first: earlier codes, whose alphas and grades are kept; None: start afresh.
         """
-        options.check()
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
         self._step = options.step / 255
         self.blocks = blocks_of(self._sizes)

@@ -166,6 +166,7 @@ def bake_field(
 ) -> BakeState:
     """Bake a scene as it is, without photographs; with `pixels_per_texel` only the tiles of its field, for a polish."""
     options, progress = options or BakeOptions(), progress or no_progress
+    options.check()
     if pixels_per_texel is not None:
         return field_tiles(trained_texels(scene, options), scene.field, cameras, pixels_per_texel, progress)
     return bake(scene, cameras, (), torch.zeros(3), options, RefineOptions(), progress)

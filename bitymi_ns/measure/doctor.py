@@ -6,6 +6,7 @@ import os
 import platform
 import shutil
 import time
+import warnings
 from collections.abc import Iterator
 
 import torch
@@ -51,10 +52,12 @@ def examine() -> Iterator[tuple[str, str]]:
     except Exception as error:
         yield "kernels", f"CPU: {why(error)}"
     try:
-        from bitymi_ns.plugin.run.config import method_config
-        from bitymi_ns.plugin.run.device import built, why_not_cuda
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # torch's, about code of others
+            from bitymi_ns.plugin.run.config import method_config
+            from bitymi_ns.plugin.run.device import built, why_not_cuda
 
-        method_config("bitymi")
+            method_config("bitymi")
     except Exception as error:
         yield "nerfstudio", f"the methods cannot be loaded: {type(error).__name__}: {why(error)}"
         yield "result", ""

@@ -24,6 +24,7 @@ from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source,
 from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, lists_by_name, read_split_lists
 from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
 from bitymi_ns.capture.types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
+from bitymi_ns.exit_messages import line_of
 from bitymi_ns.trust import listed
 
 Choice = Literal["auto", "triangulate", "random"]
@@ -149,7 +150,10 @@ def read_capture(options: CaptureOptions, need_photos: bool = True, want_points:
         need_photos: fail if photographs are missing; else their files are not opened.
         want_points: a scene starts from the points: color them, and triangulate missing ones.
     """
-    return _Reader(options, options.find(), need_photos, want_points).read()
+    try:
+        return _Reader(options, options.find(), need_photos, want_points).read()
+    except OSError as error:
+        fail(line_of(error) or str(error), error)
 
 
 @dataclass

@@ -115,6 +115,10 @@ def find_config() -> None:
     i, path = _given_config()
     if path is None or MESH_COMMAND in sys.argv[1:2]:
         return
+    try:
+        path.exists()
+    except OSError as error:  # no permission for a folder above
+        fail(f"{exit_messages.line_of(error)}.", error)
     bundle = bundle_at(path)
     if bundle is not None and (bundle.is_file() or not (bundle / CONFIG).is_file()):
         how = f"`bitymi unpack {bundle}` writes it as a folder with one; give that."

@@ -1,6 +1,8 @@
 """A bundle in one file, or without config.yml: read by our commands, refused in one line by nerfstudio's, and unpacked
 to a folder that these open."""
 
+import errno
+import os
 import shutil
 import subprocess
 import sys
@@ -104,6 +106,13 @@ def test_nerfstudios_commands_take_a_folder_and_name_what_is_missing(
         monkeypatch.setattr(sys, "argv", ["ns-eval", "--load-config", str(given)])
         with pytest.raises(InputError, match="there is no .*yml: give the config.yml of a run"):
             find_config()
+    monkeypatch.setattr(Path, "exists", denied)
+    with pytest.raises(InputError, match="nowhere.yml cannot be read or written: you have no permission for it"):
+        find_config()
+
+
+def denied(path: Path) -> bool:
+    raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
 
 def test_the_command_ends_in_one_line(packed: Path) -> None:

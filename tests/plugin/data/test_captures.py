@@ -11,6 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
+from bitymi_ns import load_capture
+from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.data import dataset
 from bitymi_ns.plugin.data.capture_checks import reporting_input_errors
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
@@ -135,3 +137,12 @@ def test_a_file_without_permission_is_named(capture: Path, monkeypatch: pytest.M
     with expect(f"{capture / 'images'} cannot be read or written: you have no permission for it"):
         with reporting_input_errors(BitymiDataManagerConfig(data=capture)):
             BitymiDataManagerConfig(data=capture).setup()
+
+
+def test_a_capture_without_permission_is_a_capture_error(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def denied(*_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(capture))
+
+    monkeypatch.setattr("bitymi_ns.capture.read.recognise", denied)
+    with pytest.raises(CaptureError, match=f"{capture} cannot be read or written: you have no permission for it"):
+        load_capture(capture)

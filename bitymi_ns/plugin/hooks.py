@@ -109,25 +109,22 @@ def find_config() -> None:
     """Take a folder's config.yml, and stop before nerfstudio loads what is no YAML, or of classes that are gone.
 
     Changes: --load-config in `sys.argv`, when the plugin is loaded. For: commands with that option but MESH_COMMAND,
-    which reads bundles without config.yml. Without: tracebacks of folders, missing files, binary data and modules.
-    Superfluous once nerfstudio reports an unreadable config.yml.
+    which reads bundles without config.yml. Without: tracebacks. Superfluous once nerfstudio reports these.
     """
     i, path = _given_config()
     if path is None or MESH_COMMAND in sys.argv[1:2]:
         return
     try:
-        path.exists()
-    except OSError as error:  # no permission for a folder above
+        config, bundle = path / CONFIG if path.is_dir() else path, bundle_at(path)
+        if bundle is not None and (bundle.is_file() or not (bundle / CONFIG).is_file()):
+            how = f"`bitymi unpack {bundle}` writes it as a folder with one; give that."
+            fail(f"{bundle} has no {CONFIG} for nerfstudio's commands: {how}")
+        if not config.is_file():
+            fail(f"there is no {config}: give the {CONFIG} of a run (ns-train says where it is) or of a bundle.")
+        if b"bitymi_ns.host." in config.read_bytes():
+            fail(f"{config} is of an early version, whose modules bitymi_ns.host are gone: train or export again.")
+    except OSError as error:
         fail(f"{exit_messages.line_of(error)}.", error)
-    bundle = bundle_at(path)
-    if bundle is not None and (bundle.is_file() or not (bundle / CONFIG).is_file()):
-        how = f"`bitymi unpack {bundle}` writes it as a folder with one; give that."
-        fail(f"{bundle} has no {CONFIG} for nerfstudio's commands: {how}")
-    config = path / CONFIG if path.is_dir() else path
-    if not config.is_file():
-        fail(f"there is no {config}: give the {CONFIG} of a run (ns-train says where it is) or of a bundle.")
-    if b"bitymi_ns.host." in config.read_bytes():
-        fail(f"{config} is of an early version, whose modules bitymi_ns.host are gone: train or export again.")
     if config != path:
         sys.argv[i] = f"--load-config={config}" if "=" in sys.argv[i] else str(config)
 

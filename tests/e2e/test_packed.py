@@ -106,7 +106,7 @@ def test_nerfstudios_commands_take_a_folder_and_name_what_is_missing(
         monkeypatch.setattr(sys, "argv", ["ns-eval", "--load-config", str(given)])
         with pytest.raises(InputError, match="there is no .*yml: give the config.yml of a run"):
             find_config()
-    monkeypatch.setattr(Path, "exists", denied)
+    monkeypatch.setattr(Path, "is_dir", denied)
     with pytest.raises(InputError, match="nowhere.yml cannot be read or written: you have no permission for it"):
         find_config()
 

@@ -126,5 +126,5 @@ def test_bundles_that_are_damaged_newer_or_gone(copied: Path, tmp_path: Path) ->
         eval_setup(copied / "config.yml")
     info = json.loads((copied / "bundle.json").read_text())
     (copied / "bundle.json").write_text(json.dumps({**info, "version": "7.0"}))
-    with pytest.raises(InputError, match="version 6.0.*update bitymi-ns"):
+    with pytest.raises(InputError, match="version 7.0.*update bitymi-ns"):
         eval_setup(copied / "config.yml")

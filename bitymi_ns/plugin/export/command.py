@@ -120,11 +120,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
     def main(self) -> None:
         """Run the export."""
         exit_messages.install()
-        earlier = None
+        reserved, earlier = False, None
         bake_options = self._options()
         try:
             with reserved_bundle(self.output_dir, self.overwrite, warn, " (--output-dir)"):
-                earlier = bundle_version(self.output_dir)
+                reserved, earlier = True, bundle_version(self.output_dir)
                 if self.extras:
                     reserve_extras(self.extras, extras_folder(self.output_dir), self.overwrite)
                 if self.check_room:
@@ -132,7 +132,8 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 self._run(bake_options)
         except KeyboardInterrupt:
             there = bundle_version(self.output_dir)
-            state = "was not written" if there is None else "is the earlier one" if there == earlier else "is complete"
+            unwritten = not reserved or there == earlier
+            state = "was not written" if there is None else "is the earlier one" if unwritten else "is complete"
             warn(f"The export was interrupted; the bundle {self.output_dir} {state}.")
             raise SystemExit(INTERRUPTED) from None
         except BundleError as error:

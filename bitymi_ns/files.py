@@ -156,8 +156,8 @@ def _check_movable(place: Path) -> None:
                 raise
         return
     new, _ = _temporary_paths(place)
-    new.mkdir()
     try:
+        new.mkdir()
         (new / "something").mkdir()
         place.rename(new)
     except OSError as error:

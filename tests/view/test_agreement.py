@@ -10,7 +10,6 @@ import pytest
 from bitymi_ns.bundle import BundleError, ktx2, ply, read_bundle
 from bitymi_ns.codec.streams import compress
 from bitymi_ns.view import site_of
-from tests.bundle.compact_scene import STORED, write_stored
 from tests.bundle.damage import amend
 from tests.view.conftest import write
 from tests.view.test_browser import page_of
@@ -51,25 +50,6 @@ def texel(value: float, channel: int = 0) -> Damage:
         pages[0, channel] = value
         payload = [page.tobytes() for page in pages]
         ktx2.write_ktx2(path, payload, image.format, image.width, image.height, "a test")
-
-    return damage
-
-
-def frame(held: int) -> Damage:
-    """Change the first frame of a surfels.bin of version 3 to one block of equal bytes, a byte declared per surfel."""
-
-    def damage(bundle: Path) -> None:
-        data = (bundle / "surfels.bin").read_bytes()
-        header = b"\x28\xb5\x2f\xfd" + bytes([0x20, STORED]) + (held << 3 | 0b011).to_bytes(3, "little")
-        stated = json.loads((bundle / "bundle.json").read_text())["surfels"]["columns"][0]["planes"][0]
-        made = header + b"\0"
-        (bundle / "surfels.bin").write_bytes(made + data[stated[0] :])
-        stated[0] = len(made)
-
-        def change(info: dict) -> None:
-            info["surfels"]["columns"][0]["planes"][0] = stated
-
-        amend(bundle, change)
 
     return damage
 
@@ -116,9 +96,6 @@ TABLE: list[tuple[str, str, Damage, bool]] = [
     ("a colour beyond its limit", "bc7", column("view_base_2", 300.0), False),
     ("a term beyond its limit", "bc7", column("term_0", 3e7, "view_term"), False),
     ("a colour of a term of NaN", "bc7", column("term_4", NAN, "view_term"), False),
-    ("a frame that holds what it declares", "planes", frame(STORED), True),
-    ("a frame that holds more", "planes", frame(STORED + 5), False),
-    ("a frame that holds less", "planes", frame(STORED - 5), False),
     ("a column of other numbers", "compact", numbers(positions(COUNT)), True),
     ("a column of more rows", "compact", numbers(positions(COUNT + 5)), False),
     ("a column of fewer rows", "compact", numbers(positions(COUNT - 5)), False),
@@ -137,7 +114,6 @@ def bundles(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         "fp16": write(folder / "fp16", "fp16", COUNT),
         "fp16 alpha": write(folder / "alpha", "fp16", COUNT, alpha=True),
         "compact": write(folder / "compact", "uint8", COUNT, compact=True),
-        "planes": write_stored("sg", folder / "planes"),
     }
 
 

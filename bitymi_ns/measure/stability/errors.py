@@ -15,7 +15,6 @@ from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import (
     ALPHAS,
     PLAIN,
-    RIM,
     SV_KEYS,
     TEXELS,
     SceneCase,
@@ -173,7 +172,7 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
     projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, near)
     if way.alpha:
         projection.alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0)
-    fragments = ops.trace(projection, RIM)
+    fragments = ops.trace(projection, way.rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
     image = ops.blended_image(fragments, projection, base, **textured, maps=True)
@@ -196,7 +195,7 @@ def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     geometry = [leaves[key] for key in GEOMETRY]
     texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]
     tiles = tile_images(torch.cat(texels, 1)) if texels else None
-    result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=RIM)
+    result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=way.rim)
     images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
     trace = result.trace
     return _Result(images, trace.blended, trace.low_pass, leaves, cells(trace.uv) if way.texels else None)

@@ -65,7 +65,7 @@ def manifest(format: str) -> str:
     """Write the bundle.json of a scene of 100 surfels."""
     files = {name: {"bytes": size, "sha256": "0" * 64} for name, size in (("surfels.ply", 1000), ("atlas.ktx2", 5000))}
     info = {
-        "version": "1.3",
+        "version": "6.0",
         "surfels": {"count": 100, "view_color": "sv", "sites": 7},
         "atlas": {"format": format, "width": 64, "height": 64, "layers": 1, "offset": 0.0, "scale": 1.0},
         "render": {"near": 0.2, "weight_bound": 0.02, "background": [0.0, 0.0, 0.0]},

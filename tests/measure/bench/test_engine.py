@@ -86,7 +86,7 @@ def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
     fakes, matrix: Matrix, capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work, python = tmp_path / "work", fakes.python(monkeypatch)
-    words = [python, "-m", "bitymi_ns.cli", "bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10"]
+    words = [python, "-m", "bitymi_ns", "bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10"]
     words += ["--formats", "bc7", "--pictures", "0", "--work", str(work)]
     fakes.slow.write_text("ns-export")
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)

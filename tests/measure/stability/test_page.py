@@ -20,10 +20,10 @@ def test_the_page_and_its_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert cli.main(["stability", "--output", str(target)]) == 0
     text = target.read_text("utf8")
     assert "(numbers.png)" in text and (tmp_path / "deep" / "numbers.png").read_bytes().startswith(b"\x89PNG")
-    assert text.count("1 of 2 cases are accurate") == 3 and "1 of 1 cases are accurate" in text
+    assert text.count("1 of 2 cases are accurate") == 3
     assert "accurate, 3 as the inputs allow, 0 loses figures" in text and "| edge on |" in text
     assert sorted(path.name for path in target.parent.iterdir()) == ["numbers.md", "numbers.png"]
-    assert "15 scenes, 0 of them" in capsys.readouterr().out
+    assert "14 scenes, 0 of them" in capsys.readouterr().out
     with pytest.raises(SystemExit):
         cli.main(["stability", "--backend", "abacus"])
     assert "invalid choice 'abacus'" in capsys.readouterr().err

@@ -15,7 +15,8 @@ HOST = """<!doctype html><link rel="icon" href="data:,"><iframe id="a" src="{a}"
 <iframe id="b" src="{b}"></iframe>
 <script>
 window.got = [];
-addEventListener('message', (e) => got.push({{ from: e.source === a.contentWindow ? 'a' : 'b', ...e.data }}));
+const sender = (window) => (window === a.contentWindow ? 'a' : window === b.contentWindow ? 'b' : 'one gone');
+addEventListener('message', (e) => got.push({{ from: sender(e.source), ...e.data }}));
 window.post = (id, data) => window[id].contentWindow.postMessage(data, '*');
 window.of = (type) => got.filter((m) => m.type === 'bitymi/1/' + type);
 </script>"""

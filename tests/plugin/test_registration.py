@@ -146,24 +146,11 @@ def test_a_change_of_nerfstudio_that_fails_takes_no_other_with_it(
     assert made == list(CHANGES)
 
 
-OLD_MODULES = {
-    **{f"plugin.data.{name}": f"host.{name}" for name in ("datamanager", "dataparser", "dataset")},
-    "plugin.run.model": "host.model",
-    "plugin.run.trainer.BitymiPipeline": "host.pipeline.BitymiPipeline",
-    "plugin.run.trainer.BitymiTrainer": "host.trainer.BitymiTrainer",
-    "plugin.run.config": "host.config",
-    "plugin.run.bundle_model": "host.bundle_config",
-}
-
-
 @pytest.mark.parametrize("model", [None, BakedModelConfig(background=(1.0, 1.0, 1.0))])
 def test_a_config_of_an_earlier_version_loads(model: BakedModelConfig | None) -> None:
     run = fresh()
     run.pipeline.model = model or run.pipeline.model
     text = yaml.dump(run)
-    for new, old in OLD_MODULES.items():
-        text = text.replace(f"bitymi_ns.{new}", f"bitymi_ns.{old}")
-    assert "plugin" not in text
     text = re.sub("( +)falloff_gamma", r"\1falloff_error: l1_sum\n\1falloff_gamma", text)  # removed options
     text = re.sub("( +)max_norm", r"\1fused: true\n\1max_norm", text)
     assert yaml.load(text, yaml.Loader) == run

@@ -20,6 +20,11 @@ PER_FRAGMENT = 36  # bytes: list, gradients of weights and coordinates, order of
 FRAGMENTS = 45  # fragments per pixel of a view; 28 to 45 were measured
 
 
+def available_memory(used: float) -> float:
+    """Return the bytes that processes which use `used` bytes may have in all, within the limit of a control group."""
+    return min(psutil.virtual_memory().available + used, memory_limit())
+
+
 def room_to_grow(device: torch.device, processes: Processes) -> float:
     """Return the bytes that a process may take beyond those in use, the same in all processes of a run; below 0 if too
     many are in use. Every process calls it."""
@@ -28,8 +33,7 @@ def room_to_grow(device: torch.device, processes: Processes) -> float:
     else:
         used = torch.tensor(psutil.Process().memory_info().rss, dtype=torch.float64)
         processes.sum(used)
-        there = min(psutil.virtual_memory().available + float(used), memory_limit())
-        left = (SHARE * there - float(used)) / processes.count
+        left = (SHARE * available_memory(float(used)) - float(used)) / processes.count
     least = torch.tensor(-left, dtype=torch.float64)
     processes.maximum(least)
     return -float(least)

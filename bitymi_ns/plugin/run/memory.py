@@ -9,7 +9,6 @@ import torch
 
 from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_colors import choice_bytes
-from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops import can_rasterize, project
 from bitymi_ns.ops.capacity import NUMBERS, free_memory
 from bitymi_ns.ops.project import GEOMETRY
@@ -23,7 +22,15 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.forecast import KEPT
-from bitymi_ns.train.memory import PER_FRAGMENT, PER_PIXEL, PER_SURFEL, PER_TEXEL, PER_TEXEL_SUM, SHARE
+from bitymi_ns.train.memory import (
+    PER_FRAGMENT,
+    PER_PIXEL,
+    PER_SURFEL,
+    PER_TEXEL,
+    PER_TEXEL_SUM,
+    SHARE,
+    available_memory,
+)
 from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget
 
@@ -167,9 +174,7 @@ def _state(
     if low < high:
         numbers = "{:.2f} to {:.2f}"
     say(f"{what} will take {numbers.format(low / 1e9, high / 1e9)} GB of {memory} for {photographs}.")
-    # with the process's own, within its control group's limit
-    of_machine = min(psutil.virtual_memory().available + psutil.Process().memory_info().rss, memory_limit())
-    available = free_memory(device) if card else of_machine
+    available = free_memory(device) if card else available_memory(psutil.Process().memory_info().rss)
     there = f"the {available / 1e9:.1f} GB that {where} has available"
     if low > available:
         warn(f"That is more than {there}. Close other programs, or {advice}.")

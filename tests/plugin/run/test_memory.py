@@ -17,6 +17,7 @@ from bitymi_ns.bake import BakeOptions
 from bitymi_ns.bake.state import BakeState
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tuning_views import TexelList, TuningViews
+from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.plugin.run import memory
 from bitymi_ns.scene import Camera, Scene
@@ -63,7 +64,7 @@ def test_one_line_says_what_will_be_taken(
     state(scene[0], [scene[1]] * 20, 0)
     assert "GB that this machine has available" in said(capsys)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10**16))
-    monkeypatch.setattr(memory, "memory_limit", lambda: 2e9)
+    monkeypatch.setattr("bitymi_ns.train.memory.memory_limit", lambda: 2e9)
     state(scene[0], [scene[1]] * 20, 0)
     assert "more than the 2.0 GB that this machine has available" in said(capsys)
 
@@ -263,5 +264,5 @@ def test_the_limit_of_a_control_group_counts(tmp_path: Path, groups: str, file: 
     (tmp_path / file).write_text("5000000000\n")
     (tmp_path / "memory.max").write_text("max\n")
     (tmp_path / "cgroups").write_text(groups + "\n")
-    assert memory.memory_limit(tmp_path, tmp_path / "cgroups") == limit
-    assert memory.memory_limit(tmp_path, tmp_path / "none") == float("inf")
+    assert memory_limit(tmp_path, tmp_path / "cgroups") == limit
+    assert memory_limit(tmp_path, tmp_path / "none") == float("inf")

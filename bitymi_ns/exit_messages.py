@@ -68,7 +68,7 @@ def end_as_by_ctrl_c() -> list[int]:
     changed = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
     for number in changed:
         signal.signal(number, signal.default_int_handler)
-    return list(changed)
+    return changed
 
 
 def run(command: Callable[[], int]) -> int:

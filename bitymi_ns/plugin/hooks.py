@@ -159,7 +159,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
         datamanager = config.pipeline.datamanager
         data = datamanager.data or getattr(datamanager.dataparser, "data", None)
         if data is not None and not Path(data).exists() and has_cameras(model.bundle):  # its capture is gone
-            gray = found is not None and render.needs_no_photographs(found[0])
+            gray = found is not None and render.leave_out_photographs(found[0])
             datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data), gray=gray)
             datamanager.data = model.bundle
         if evaluated is not None:  # no pickled data may lie in a bundle

@@ -38,8 +38,9 @@ FAINT = 1 / 255  # accumulation of a pixel that shows nothing
 OPTION = " (--output-path)."
 
 
-def needs_no_photographs(command: Any) -> bool:
-    """Return True for `ns-render dataset` of outputs alone; where it names none, it then draws all of them."""
+def leave_out_photographs(command: Any) -> bool:
+    """Have `ns-render dataset` draw all outputs, and no photographs, if it names none; return True if it then needs no
+    photographs, False for other commands."""
     if type(command).__name__ != "DatasetRender":
         return False
     if command.rendered_output_names is None:

@@ -1,5 +1,6 @@
 """Termination of commands with one line and no traceback: on interrupts, closed pipes, and lack of space or memory."""
 
+import atexit
 import errno
 import os
 import re
@@ -71,6 +72,11 @@ def end_as_by_ctrl_c() -> list[int]:
     return changed
 
 
+def _end_by_default(numbers: list[int]) -> None:
+    for number in numbers:
+        signal.signal(number, signal.SIG_DFL)
+
+
 def run(command: Callable[[], int]) -> int:
     """Run a command and return its exit status, also after exceptions that `line_of` describes.
 
@@ -92,8 +98,7 @@ def run(command: Callable[[], int]) -> int:
         _print_error(line)
         return INTERRUPTED if isinstance(error, KeyboardInterrupt) else 1
     finally:
-        for number in changed:
-            signal.signal(number, signal.SIG_DFL)
+        _end_by_default(changed)
 
 
 class _Output:
@@ -136,7 +141,7 @@ def install(then: Callable[[], str] = str) -> None:
     """
     global _then
     _then, before = then, sys.excepthook
-    end_as_by_ctrl_c()
+    atexit.register(_end_by_default, end_as_by_ctrl_c())  # the interpreter prints exceptions of its own shutdown
 
     def handle(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         line = line_of(error)

@@ -140,6 +140,15 @@ def test_signals_of_others_remove_what_was_begun(how: signal.Signals, begun: str
     assert said == "bitymi: interrupted\n" and list(tmp_path.iterdir()) == []
 
 
+def test_a_signal_to_an_interpreter_that_shuts_down_is_silent() -> None:
+    code = (
+        "import atexit, os, signal; from bitymi_ns import exit_messages\n"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM)); exit_messages.install()"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == -signal.SIGTERM and ended.stderr == ""
+
+
 def test_a_command_leaves_the_signals_as_they_were() -> None:
     before = [signal.getsignal(each) for each in (signal.SIGTERM, signal.SIGHUP)]
     assert exit_messages.run(lambda: 3) == 3

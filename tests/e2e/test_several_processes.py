@@ -93,7 +93,7 @@ def test_a_run_that_lost_a_process_goes_on_bit_for_bit_alike_until_ctrl_c(
     errors = run.communicate()[1].splitlines()
     assert run.returncode == 1 and errors[-1].startswith("bitymi: process 2 of the 2 of this run was ended by SIGKILL")
     told = [line for line in errors if any(w in line for w in ("Traceback", "torch.distributed", "Root Cause", "WARN"))]
-    assert told == []
+    assert told == [], "\n".join(errors)
     resumed.load_dir, resumed.steps_per_save = lost.get_checkpoint_dir(), 1000  # so that only Ctrl-C saves
     run = started(resumed)
     wait_for(resumed.get_base_dir() / FILE, run, lines=2)

@@ -4,7 +4,7 @@
 `card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies and
 nerfstudio's except torch and numpy, and sorts them into parts FOLDER/0, FOLDER/1, ... of limited size. `card.py run
 ORDER... --stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has its own time
-limit. Orders joined by a plus sign run concurrently, for steps that are not timed."""
+limit."""
 
 import argparse
 import os
@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,119 +26,66 @@ NEEDED += ("appdirs", "mediapy", "pyquaternion", "pytorch-msssim", "splines", "p
 """Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt.
 nerfstudio's other imports have stand-ins (gpu_nerfstudio.py)."""
 TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
+BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
+CHECKED = ("baked", "training", "texels", "listed")  # sections of `times.py cuda`
+SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
+ORDERS = ("check", "webgpu", "train", "frames", "gaussians", "peers", "nerfstudio")
+GAUSSIANS = ("300000", "1000000")  # numbers of Gaussians trained for comparison
 
 
 @dataclass(frozen=True)
 class Step:
-    """One or several concurrent commands with a time limit."""
+    """A command with a time limit."""
 
     name: str  # in the summary
-    commands: Sequence[Sequence[str]]
+    command: Sequence[object]
     limit: float  # seconds
 
 
-def python(script: str, *words: str) -> list[str]:
-    """Build a command that runs a script of this folder."""
-    return [sys.executable, f"benchmarks/{script}", *words]
-
-
-def sanitizer(tool: str, *sections: str) -> list[str]:
-    """Build a command that runs kernels under a tool of compute-sanitizer."""
-    command = ["compute-sanitizer", "--tool", tool, "--error-exitcode", "9", "--print-limit", "20"]
-    return [*command, *python("times.py", "cuda", "--sections", *sections)]
-
-
-def orders(results: Path, data: Path, surfels: Sequence[str] = (), steps: int | None = None) -> dict[str, list[Step]]:
-    """Build the steps of every order, by name. `frames`, `peers` and `kernels` render the bundles of `train`, `peers`
-    also the Gaussians of `gaussians`.
+def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (), length: int = 0) -> list[Step]:
+    """Build the steps of an order. `frames` and `peers` render the bundles of `train`, `peers` also the Gaussians of
+    `gaussians`.
 
     Args:
         results: folder of the tables.
         data: folder of captures.
         surfels: numbers of surfels of the synthetic scenes.
-        steps: length of the runs of `train` and `nerfstudio`; None: `REFERENCE_STEPS`, and the script's default.
+        length: steps of the runs of `train` and `nerfstudio`; 0: 30,000, and the script's default.
     """
-    length = [] if steps is None else ["--steps", str(steps)]
-    on_card = ("--runs", f"{steps or REFERENCE_STEPS}/1", "--device", "cuda", "--work", results / "runs")
-    pytest = [sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "-o", "faulthandler_timeout=60"]
+    times = (sys.executable, "benchmarks/times.py")
+    pytest = (sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "-o", "faulthandler_timeout=60")
+    sanitizer = ("compute-sanitizer", "--error-exitcode", "9", "--print-limit", "20", "--tool")
     bundles = results / "bundles"
-    large = ("--surfels", "150000", "--size", "1297x840")
-    kept = sorted(str(file.parent) for file in bundles.glob("**/bundle.json"))
-    bundled = ["--bundles", *kept] if kept else []
-
-    def page(name: str, script: str, *words: object) -> list[str]:
-        """Build a command that also writes its Markdown to a file of the results."""
-        return python(script, *map(str, words), "--output", str(results / f"{name}.md"))
-
-    def of_each(what: str, limit: float, commands: Callable[[str], list[list[str]]]) -> list[Step]:
-        """Build a step for each capture."""
-        names = sorted(file.parent.name for file in data.glob("*/transforms.json"))
-        return [Step(f"{what}{name}", commands(name), limit) for name in names]
-
-    return {
-        "check": [
-            Step("block textures", [[sys.executable, "-c", BLOCKS]], 60),
-            Step("tests", [[*pytest, "tests/cuda", "-k", "not emulated"]], 240),
-            Step("kernels", [python("times.py", "cuda", *large, "--times", "20")], 90),
-            Step("sanitizers", [sanitizer(tool, *CHECKED) for tool in SANITIZERS], 150),
-        ],
-        "train": of_each(
-            "", 600, lambda name: [page(name, "long.py", data / name, "--keep", bundles / name, *on_card)]
-        ),
-        "frames": [
-            Step(
-                "frames", [page("frames", "times.py", "frames", "--runs", "100", "--surfels", *surfels, *bundled)], 200
-            )
-        ],
-        "gaussians": of_each(
-            "Gaussians of ",
-            300,
-            lambda name: [
-                python("times.py", "peers", *map(str, (data / name, "--train", count, "--gaussians", results / name)))
-                for count in GAUSSIANS
-            ],
-        ),
-        "peers": of_each(
-            "peers on ",
-            120,
-            lambda name: [
-                page(f"{name}-peers", "times.py", "peers", data / name, "--bundles", *sorted(bundles.glob(f"{name}/*")))
-                + ["--gaussians", str(results / name)]
-            ],
-        ),
-        "kernels": [
-            Step(
-                f"kernels of bundles, {size}",
-                [python("times.py", "cuda", "--sections", "--size", size, "--times", "20", *bundled)],
-                60,
-            )
-            for size in ("1297x840", "3840x2160")
-        ],
-        "nerfstudio": of_each(
-            "nerfstudio on ",
-            600,
-            lambda name: [
-                page(f"{name}-nerfstudio", "times.py", "nerfstudio", data / name, "--folder", results / f"{name}-runs")
-                + length
-            ],
-        ),
-        "webgpu": [Step("webgpu tests", [[*pytest, "tests/ops/webgpu"]], 60)],
-    }
-
-
-REFERENCE_STEPS = 30_000  # default length of the runs of `train`
-GAUSSIANS = (300_000, 1_000_000)  # numbers of Gaussians trained for comparison
-
-
-def together(steps: Sequence[Step]) -> Step:
-    """Merge steps into one of concurrent commands."""
-    commands = [command for step in steps for command in step.commands]
-    return Step(" + ".join(step.name for step in steps), commands, max(step.limit for step in steps))
-
-
-BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-CHECKED = ("baked", "training", "texels", "listed")  # sections of `times.py cuda`
-SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
+    page = ("--output", results / f"{order}.md")
+    if order == "check":
+        large = ("--surfels", "150000", "--size", "1297x840", "--times", "20")
+        return [
+            Step("block textures", [sys.executable, "-c", BLOCKS], 60),
+            Step("tests", [*pytest, "tests/cuda", "-k", "not emulated"], 240),
+            Step("kernels", [*times, "cuda", *large], 90),
+            *(Step(tool, [*sanitizer, tool, *times, "cuda", "--sections", *CHECKED], 150) for tool in SANITIZERS),
+        ]
+    if order == "webgpu":
+        return [Step("webgpu tests", [*pytest, "tests/ops/webgpu"], 60)]
+    if order == "frames":
+        kept = sorted(file.parent for file in bundles.glob("**/bundle.json"))
+        bundled = ["--bundles", *kept] if kept else []
+        return [Step(order, [*times, "frames", "--runs", "100", "--surfels", *surfels, *bundled, *page], 200)]
+    steps = []
+    for folder in sorted(file.parent for file in data.glob("*/transforms.json")):
+        name, kept = folder.name, bundles / folder.name
+        page = ("--output", results / f"{name}-{order}.md")
+        gaussians = ("--gaussians", results / name)
+        on_card = ("--runs", f"{length or 30_000}/1", "--device", "cuda", "--work", results / "runs", "--keep", kept)
+        runs = ("--folder", results / f"{name}-runs", *(("--steps", length) if length else ()))
+        command, limit = {
+            "train": ((sys.executable, "benchmarks/long.py", folder, *on_card, *page), 600),
+            "gaussians": ((*times, "peers", folder, "--train", *GAUSSIANS, *gaussians), 600),
+            "peers": ((*times, "peers", folder, "--bundles", *sorted(kept.glob("*")), *gaussians, *page), 120),
+            "nerfstudio": ((*times, "nerfstudio", folder, *runs, *page), 600),
+        }[order]
+        steps.append(Step(f"{order} on {name}", command, limit))
+    return steps
 
 
 def stage(arguments: argparse.Namespace) -> int:
@@ -148,7 +95,7 @@ def stage(arguments: argparse.Namespace) -> int:
     for file in folder.glob("*/*"):
         file.rename(folder / file.name)
     kept = ROOT / "build" / f"card-{Path(arguments.python).name}"
-    tools, build = kept / "tools", kept / "build"
+    tools = kept / "tools"
     if not tools.exists():
         subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
         subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
@@ -156,7 +103,7 @@ def stage(arguments: argparse.Namespace) -> int:
     for old in folder.glob("bitymi_ns-*.whl"):
         old.unlink()
     architectures = f"cmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}"
-    settings = ("cmake.define.BITYMI_CUDA=ON", architectures, f"build-dir={build}")
+    settings = ("cmake.define.BITYMI_CUDA=ON", architectures, f"build-dir={kept / 'build'}")
     options = [f"--config-settings={setting}" for setting in settings]
     wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
     subprocess.run([*wheel, *options], check=True)
@@ -216,36 +163,29 @@ def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
 
 
 def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, deadline: float) -> str:
-    """Run a step with a log per command, and return its line of the summary."""
+    """Run a step with a log, and return its line of the summary."""
     start = time.perf_counter()
     limit = min(step.limit, deadline - time.monotonic())
     if limit < 5:
         return f"| {step.name} | not begun: no time left | |"
-    running, statuses = [], []
-    with tempfile.TemporaryDirectory() as folder:
-        # unbuffered, so that logs are complete
+    command, text = [str(word) for word in step.command], logs / f"{step.name}.txt"
+    # unbuffered, so that logs are complete
+    with tempfile.TemporaryDirectory() as folder, text.open("w") as log:
         environment = {**environment, "TMPDIR": folder, "PYTHONUNBUFFERED": "1"}
-        if len(step.commands) > 1:
-            environment["OMP_NUM_THREADS"] = str(max(1, (os.cpu_count() or 1) // len(step.commands)))
-        how = {"cwd": tree, "env": environment, "stderr": subprocess.STDOUT, "start_new_session": True}
-        for i, command in enumerate(step.commands):
-            with (text := logs / f"{step.name}-{i}.txt").open("w") as log:
-                log.write(f"{' '.join(command)}\n")
-                log.flush()
-                try:
-                    running.append((subprocess.Popen(command, stdout=log, **how), text))
-                except OSError as error:
-                    return f"| {step.name} | {error} | |"
-        for process, text in running:
-            try:
-                status = process.wait(max(1.0, limit - (time.perf_counter() - start)))
-                last = text.read_text(errors="replace").strip().splitlines()[-1].replace("|", "/")
-                statuses.append(f"{status}: {last}" if status else "0")
-            except subprocess.TimeoutExpired:
-                os.killpg(process.pid, 9)
-                process.wait()
-                statuses.append("stopped")
-    return f"| {step.name} | {', '.join(statuses)} | {time.perf_counter() - start:.0f} |"
+        print(*command, file=log, flush=True)
+        how = {"cwd": tree, "env": environment, "stdout": log, "stderr": subprocess.STDOUT}
+        try:
+            process = subprocess.Popen(command, start_new_session=True, **how)
+            result = str(process.wait(limit))
+        except OSError as error:
+            result = str(error)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, 9)
+            process.wait()
+            result = "stopped"
+    last = text.read_text(errors="replace").strip().splitlines()[-1].replace("|", "/")
+    result += "" if result == "0" else f": {last}"
+    return f"| {step.name} | {result} | {time.perf_counter() - start:.0f} |"
 
 
 def main() -> int:
@@ -260,20 +200,16 @@ def main() -> int:
     staging.add_argument("--architectures", default="90", help="compute capabilities of its card (%(default)s)")
     staging.add_argument("--megabytes", type=float, default=38, help="most of a part (%(default)s)")
     running = commands.add_parser("run", help="run orders on the machine")
-    names = list(orders(Path(), Path()))
-    running.add_argument("orders", nargs="+", metavar="ORDER", help=f"{', '.join(names)}; A+B: at the same time")
+    running.add_argument("orders", nargs="+", metavar="ORDER", choices=ORDERS, help=", ".join(ORDERS))
     running.add_argument("--stage", type=Path, nargs="+", required=True, help="folders of wheels")
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
     running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")
-    running.add_argument("--steps", type=int, help="of the runs of `train` and `nerfstudio`")
+    running.add_argument("--steps", type=int, default=0, help="of the runs of `train` and `nerfstudio`")
     running.add_argument("--seconds", type=float, default=570, help="for all of it (%(default)s)")
     arguments = parser.parse_args()
     if arguments.command == "stage":
         return stage(arguments)
-    for name in (part for order in arguments.orders for part in order.split("+")):
-        if name not in names:
-            parser.error(f"no order {name}: there are {', '.join(names)}")
     deadline = time.monotonic() + arguments.seconds
     results = arguments.output.resolve()
     results.mkdir(parents=True, exist_ok=True)
@@ -281,9 +217,7 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as work:
         environment = unpack([folder.resolve() for folder in arguments.stage], Path(work))
         for order in arguments.orders:
-            known = orders(results, arguments.data.resolve(), arguments.surfels, arguments.steps)
-            steps = [step for name in order.split("+") for step in known[name]]
-            for step in steps if "+" not in order else [together(steps)]:
+            for step in steps_of(order, results, arguments.data.resolve(), arguments.surfels, arguments.steps):
                 lines.append(run_step(step, Path(work) / "tree", environment, results, deadline))
                 print(lines[-1], flush=True)
                 (results / "summary.md").write_text("\n".join(lines) + "\n")

@@ -10,25 +10,26 @@ from pathlib import Path
 import torch
 from harness import Arguments, image_size, table
 from scenes import around, textured, trained_like, with_texels
-from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.scene.baked_renderer import BakedRenderer
-from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import Scene
+
+Run = Callable[[], object]
 
 
-def baked(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """Prepare a frame with a BC7 atlas."""
+def baked(n: int, width: int, height: int, device: torch.device, every: bool = False) -> Run:
+    """Prepare a frame with a BC7 atlas; `every`: with all images."""
     scene, camera = textured(n, width, height, device)
+    if every:
+        return lambda: scene.render_views([camera], None, ops.baked.IMAGES)
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
     return renderer.run
 
 
-def bundled(folder: Path, width: int, height: int, device: torch.device) -> Callable[[], object]:
+def bundled(folder: Path, width: int, height: int, device: torch.device) -> Run:
     """Prepare a frame of a bundle."""
     bundle = read_bundle(folder, decode=False)
     renderer = BakedRenderer(bundle.scene.to(device), width, height, images=("packed",))
@@ -36,17 +37,14 @@ def bundled(folder: Path, width: int, height: int, device: torch.device) -> Call
     return renderer.run
 
 
-def images(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """Prepare a frame with a BC7 atlas and every image."""
-    scene, camera = textured(n, width, height, device)
-    return lambda: scene.render_views([camera], None, ops.baked.IMAGES)
-
-
-def training_step(scene: Scene, camera: Camera, parameters: list[Tensor]) -> Callable[[], object]:
-    """Prepare a training step: render, loss 0.8 L1 + 0.2 (1 - SSIM), backward and Adam on the parameters."""
+def training(n: int, width: int, height: int, device: torch.device, tiled: bool = False, most: int = 0) -> Run:
+    """Prepare a training step: render, loss 0.8 L1 + 0.2 (1 - SSIM), backward and Adam, with the field, or with texels
+    if `tiled`. `most`: limit of a fragment list, 0 = none."""
+    scene, camera = (with_texels if tiled else trained_like)(n, width, height, device)
+    scene.config.max_fragments = most
     # learning rate 0: the work of a step without changing the scene
-    optimizer = torch.optim.Adam(parameters, lr=0.0, fused=True)
-    photo = torch.rand(camera.height, camera.width, 3, device=parameters[0].device)
+    optimizer = torch.optim.Adam((scene.surfels if tiled else scene).parameters(), lr=0.0, fused=True)
+    photo = torch.rand(height, width, 3, device=device)
 
     def run() -> None:
         optimizer.zero_grad(set_to_none=True)
@@ -57,22 +55,9 @@ def training_step(scene: Scene, camera: Camera, parameters: list[Tensor]) -> Cal
     return run
 
 
-def training(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
-    """Prepare a training step: field, SSIM, Adam."""
-    scene, camera = trained_like(n, width, height, device)
-    return training_step(scene, camera, list(scene.parameters()))
-
-
-def texels(n: int, width: int, height: int, device: torch.device, most: int = 0) -> Callable[[], object]:
-    """Prepare a training step with texels: SSIM, Adam of the surfels. `most`: limit of a fragment list, 0 = none."""
-    scene, camera = with_texels(n, width, height, device)
-    scene.config.max_fragments = most
-    return training_step(scene, camera, list(scene.surfels.parameters()))
-
-
-def exact(n: int, width: int, height: int, device: torch.device) -> Callable[[], object]:
+def exact(n: int, width: int, height: int, device: torch.device) -> Run:
     """Prepare a training step of either texture with deterministic sums."""
-    steps = [training(n, width, height, device), texels(n, width, height, device)]
+    steps = [training(n, width, height, device, tiled) for tiled in (False, True)]
 
     def run() -> None:
         torch.use_deterministic_algorithms(True, warn_only=True)  # some of torch's own operations have none
@@ -83,8 +68,9 @@ def exact(n: int, width: int, height: int, device: torch.device) -> Callable[[],
     return run
 
 
-SECTIONS = {"baked": baked, "images": images, "training": training, "texels": texels}
-SECTIONS |= {"listed": partial(texels, most=1 << 30), "deterministic": exact}
+SECTIONS = {"baked": baked, "images": partial(baked, every=True), "training": training}
+SECTIONS |= {"texels": partial(training, tiled=True), "listed": partial(training, tiled=True, most=1 << 30)}
+SECTIONS |= {"deterministic": exact}
 
 
 def main(parser: Arguments, words: Sequence[str]) -> None:
@@ -96,8 +82,6 @@ def main(parser: Arguments, words: Sequence[str]) -> None:
     parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
     arguments = parser.parse_args(words)
     device = parser.device()
-    if not arguments.sections and not arguments.bundles:
-        parser.error("there is nothing to run: no section and no bundle is named")
     made = {name: partial(SECTIONS[name], arguments.surfels) for name in arguments.sections}
     made |= {folder.name: partial(bundled, folder) for folder in arguments.bundles}
     for name, make in made.items():
@@ -110,7 +94,7 @@ def main(parser: Arguments, words: Sequence[str]) -> None:
             print(f"{name}: done", flush=True)
 
 
-def print_times(name: str, run: Callable[[], object], runs: int) -> None:
+def print_times(name: str, run: Run, runs: int) -> None:
     """Print the device time per run of each kernel after a warm-up, longest first."""
     for _ in range(5):
         run()

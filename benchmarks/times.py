@@ -1,8 +1,7 @@
 #!/usr/bin/env python
 """Measure times: `times.py COMMAND OPTION...`; `times.py COMMAND --help` lists the options.
 
-kernels      each CPU kernel against the machine's ceilings
-host         the host's share of a CUDA training step, without a GPU
+kernels      each CPU kernel
 frames       frames of baked scenes on a GPU
 cuda         CUDA kernels: each once, for sanitizers, or its time
 peers        gsplat beside bundles of a capture on a GPU
@@ -12,7 +11,7 @@ nerfstudio   nerfstudio's commands on a capture, with a GPU or without
 import sys
 from importlib import import_module
 
-MODULES = {"kernels": "kernels", "host": "host", "frames": "gpu_frames", "cuda": "gpu_kernels"}
+MODULES = {"kernels": "kernels", "frames": "gpu_frames", "cuda": "gpu_kernels"}
 MODULES |= {"peers": "gpu_peers", "nerfstudio": "gpu_nerfstudio"}
 
 

@@ -152,9 +152,6 @@ NB_MODULE(_emulated, m) {
   m.doc() = "The CUDA kernels, thread by thread on the host: for tests.";
   m.def("set_seed", &bt::emulator::set_seed, nanobind::arg("seed"),
         "Seed of the order in which blocks and their threads take turns.");
-  m.def("set_idle", &bt::emulator::set_idle, nanobind::arg("idle"),
-        "Make launches return at once: for timing the host.");
-  m.def("launches", &bt::emulator::launches, "Kernels launched so far.");
   m.def("stale_numbers", &bt::emulator::stale_numbers, "Threads that read another block's values in shared memory.");
   m.def("open_barrier", &bt::emulator::open_barrier, "A kernel whose threads wait for one that does not come.");
   m.def("read_float4", &bt::emulator::read_float4, nanobind::arg("offset"), "A kernel that may read misaligned.");

@@ -40,8 +40,6 @@ struct Fiber {
 std::vector<std::unique_ptr<Fiber>> fibers;
 std::vector<uint64_t> shared_memory;
 std::mt19937 shuffle;
-bool no_kernels = false;
-int64_t launched = 0;
 jmp_buf scheduler;
 size_t current;
 const std::function<void()>* body;
@@ -157,8 +155,6 @@ void misaligned(const char* file, unsigned line) {
 }
 
 void set_seed(unsigned seed) { shuffle.seed(seed); }
-void set_idle(bool idle) { no_kernels = idle; }
-int64_t launches() { return launched; }
 void* dynamic_shared() { return shared_memory.data(); }
 int lane() { return int(current % kLanesOfWarp); }
 
@@ -174,8 +170,6 @@ void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std:
   const size_t threads = size_t(block.x) * block.y * block.z;
   if (!threads || threads > 1024 || !grid.x || !grid.y || !grid.z || grid.y > 65535 || grid.z > 65535)
     throw std::runtime_error(std::string(kernel) + ": invalid configuration of grid or block");
-  ++launched;
-  if (no_kernels) return;
   if (shared > 227 * 1024) throw std::runtime_error(std::string(kernel) + ": more shared memory than a block has");
   while (fibers.size() < threads) {
     fibers.push_back(std::make_unique<Fiber>());

@@ -31,8 +31,6 @@ extern dim3 grid_size;
 // barriers that can never open.
 void launch(const char* kernel, dim3 grid, dim3 block, size_t shared, const std::function<void()>& thread);
 void set_seed(unsigned seed);
-void set_idle(bool idle);  // makes launches return at once, to time what the host does
-int64_t launches();        // counts them
 
 // Faulty kernels that the emulator must detect (emulator_probe.cpp).
 int stale_numbers();            // counts threads that read what an earlier block left in shared memory

@@ -12,14 +12,13 @@ import contextlib
 import csv
 import functools
 import itertools
-import math
 import shlex
 import statistics
 import sys
 import tempfile
 import time
 from argparse import Namespace
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,9 +27,7 @@ from zlib import crc32
 import torch
 import yaml
 from harness import Arguments, image_quality, means, number, publish, say, table
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.lines import Line2D
 from scenes import SplitCapture, load_capture
 from torch import Tensor
 
@@ -38,7 +35,10 @@ from bitymi_ns import bake_scene
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.locks import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
+from bitymi_ns.measure.figure import COLORS, Panel, png
 from bitymi_ns.measure.machine import commit
+from bitymi_ns.measure.report.plots import METRICS, costs, pareto_panel
+from bitymi_ns.measure.report.records import Evaluation
 from bitymi_ns.plugin.run.metrics import LPIPS, lpips_metrics
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene import Scene
@@ -48,15 +48,10 @@ from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
-from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.preset import Loader, Preset, load_preset
 from bitymi_ns.train.views import View, eval_background
 
 RUNS = ("10000/4", "1500/2", "300/1")
-WATCHED, EVERY, WATCH = 8, 30, 300
-"""Number of training views whose loss is monitored when the texel stage begins, interval in steps, and duration."""
-WATCHED_PSNR = {0: "before_texels", WATCH: "after_texels"}
-"""Steps since the texel stage began at which held-out views are evaluated, and the figure's name."""
 COLUMNS = {
     "PSNR": ("psnr", 2),
     "mean exposure": ("mean_exposure_psnr", 2),
@@ -66,10 +61,6 @@ COLUMNS = {
     "SSIM": ("ssim", 4),
     "LPIPS": ("lpips", 4),
     "LPIPS, VGG": ("lpips_vgg", 4),
-    "before texels": ("before_texels", 2),
-    "300 later": ("after_texels", 2),
-    "loss, peak": ("peak", 2),
-    "back after": ("back_after", 0),
     "rollbacks": ("rollbacks", 0),
     "surfels": ("surfels", 0),
     "fragments per pixel": ("fragments", 1),
@@ -160,38 +151,6 @@ def forget_peak(device: torch.device) -> None:
         Path("/proc/self/clear_refs").write_text("5")
 
 
-class TexelWatch:
-    """Monitor of the loss of a few training views from the step before the texel stage on."""
-
-    def __init__(self, trainer: Trainer, views: Sequence[View]) -> None:
-        self.trainer, self.views = trainer, [views[i] for i in spread(len(views), WATCHED)]
-        self.losses: list[float] = []
-
-    def note(self) -> None:
-        since = self.trainer.step - self.trainer.training.schedule.texels_start
-        if not 0 <= since <= WATCH or since % EVERY:
-            return
-        scene, config = self.trainer.scene, self.trainer.config
-        device = scene.surfels["means"].device
-        background = eval_background(config, device)
-        with torch.no_grad():
-            pairs = [
-                (scene.render(view.camera.to(device), background, "frozen").rgb, view.target(background, device))
-                for view in self.views
-            ]
-        losses = [photometric(*pair, config.loss.ssim_weight) for pair in pairs]
-        self.losses.append(float(torch.stack(losses).mean()))
-
-    def figures(self) -> dict[str, Any]:
-        """Return the peak loss relative to the loss before, and the number of steps until it is below that again."""
-        if len(self.losses) < 2:
-            return {}
-        before, *after = self.losses
-        back = [i * EVERY for i, loss in enumerate(after, 1) if loss < before]
-        found = {"losses": [round(loss, 5) for loss in self.losses], "peak": max(after) / before}
-        return found | {"back_after": back[0] if back else math.nan}
-
-
 load = functools.lru_cache(maxsize=1)(load_capture)
 
 
@@ -214,15 +173,9 @@ def measure(run: LongRun) -> dict[str, Any]:
         device
     )
     trainer = Trainer(scene, capture.train, preset.train, run.steps)
-    watch, clock = TexelWatch(trainer, capture.train), trainer.training.clock
-    watched = {trainer.training.schedule.texels_start + wait: name for wait, name in WATCHED_PSNR.items()}
-    texels: dict[str, float] = {}
+    clock = trainer.training.clock
     shown = {run.steps * i // 20 for i in range(1, 20)}
     while trainer.step < run.steps:
-        if (name := watched.get(trainer.step)) is not None:
-            found = evaluate(scene, capture.held_out, preset.train, exposure=trainer.training.exposure)
-            texels[name] = found.psnr
-        watch.note()
         trainer.advance()
         if trainer.step in shown:
             say(f"step {trainer.step:,}: loss {trainer.loss:.4f}, {len(scene):,} surfels, {clock.cpu_seconds:.0f} s")
@@ -237,12 +190,12 @@ def measure(run: LongRun) -> dict[str, Any]:
         fragments.append(len(output.fragments) / (camera.width * camera.height))
         return output
 
-    found = quality(draw, held_out, background) | {"fragments": statistics.fmean(fragments)} | watch.figures()
+    found = quality(draw, held_out, background) | {"fragments": statistics.fmean(fragments)}
     aligned = run.align or poses.refined
     if aligned or exposure.table is not None:
         judged = evaluate(scene, capture.held_out, preset.train, poses if aligned else None, exposure)
         found |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "mean_exposure_psnr")}
-    found |= texels | {"surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
+    found |= {"surfels": len(scene), "rollbacks": trainer.training.guard.rollbacks}
     camera = capture.train[0].camera
     found |= {"cpu_seconds": clock.cpu_seconds, "seconds": clock.seconds, "peak_megabytes": peak}
     found |= {"width": camera.width, "height": camera.height}
@@ -305,40 +258,30 @@ PUBLISHED = Path(__file__).with_name("published.csv")
 pictures."""
 
 
-def draw_curves(runs: Sequence[LongRun], cells: Cells) -> Figure:
-    """Plot PSNR and LPIPS of the bundles of every run against their bytes; dashes: before the bake; crosses: PSNR that
-    others publish of the same scenes."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    for axes, name, label in zip(figure.subplots(1, 2), ("psnr", "lpips"), ("PSNR (dB)", "LPIPS"), strict=True):
-        for i, run in enumerate(runs):
-            value, color = cells.get(run.key)["value"], f"C{i}"
-            points = value["curve"]
-            title = f"{Path(run.data).name}, {run.steps:,} steps, {value.get('width')} x {value.get('height')}"
-            axes.plot(*zip(*((p["kilobytes"] / 1e3, p[name]) for p in points), strict=True), "o-", label=title)
-            axes.axhline(value[name], color=color, linestyle="--", linewidth=0.8)
-        axes.set(xlabel="MB, all files", ylabel=label, xscale="log")
-        axes.xaxis.set_major_formatter("{x:g}")
-        axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
-        axes.xaxis.set_minor_formatter("{x:g}")
-        axes.margins(x=0.2)
-        axes.grid(alpha=0.3, which="both")
-        if name == "psnr":
-            draw_published(axes, {Path(run.data).name for run in runs})
-    axes.legend()
-    return figure
-
-
-def draw_published(axes: Axes, scenes: Set[str]) -> None:
-    """Plot what `PUBLISHED` states of these scenes, a cross and a name each."""
+def draw_curves(runs: Sequence[LongRun], cells: Cells) -> bytes:
+    """Plot PSNR and LPIPS of the bundles of every run against their bytes, and what others publish of the same scenes;
+    return a PNG file."""
+    rows = []
+    for run in runs:
+        value, scene = cells.get(run.key)["value"], Path(run.data).resolve().name
+        method = f"{run.row}, {run.steps:,} steps, {value['width']} x {value['height']}"
+        for point in value["curve"]:
+            figures = {**point, "bundle_bytes": 1e3 * point["kilobytes"]}
+            rows.append(Evaluation(scene, method, True, method, figures, "", Path()))
+    scenes = sorted({row.scene for row in rows})
     with open(PUBLISHED, newline="", encoding="utf8") as file:
-        rows = [row for row in csv.DictReader(file) if row["scene"] in scenes]
-    for row in rows:
-        at = (int(row["bytes"]) / 1e6, float(row["psnr"]))
-        axes.plot(*at, "kx")
-        axes.annotate(f" {row['program']}", at, fontsize=6, va="center")
-    sizes = dict.fromkeys(f"{row['scene']} {row['pictures']}" for row in rows)
-    if sizes:
-        axes.text(0.98, 0.02, f"crosses: published, {', '.join(sizes)}", ha="right", transform=axes.transAxes)
+        for row in csv.DictReader(file):
+            if row["scene"] in scenes:
+                method = f"{row['program'].split()[0]}, published, {row['pictures']}"
+                figures = {"psnr": float(row["psnr"]), "bundle_bytes": float(row["bytes"])}
+                rows.append(Evaluation(row["scene"], method, True, method, figures, "", Path()))
+    colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(dict.fromkeys(row.method for row in rows))}
+    size, panels = costs(rows)[-1], []
+    for scene, key in itertools.product(scenes, ("psnr", "lpips")):
+        shown = [row for row in rows if row.scene == scene and key in row.results]
+        draw = functools.partial(pareto_panel, rows=shown, key=key, cost=size, colors=colors, markers={"": "o"})
+        panels.append(Panel(draw, scene, size.label, METRICS[key][0]))
+    return png(panels, [Line2D([], [], color=color, label=name) for name, color in colors.items()], most=2)
 
 
 def main() -> None:
@@ -367,7 +310,7 @@ def main() -> None:
     cells.refresh()
     publish("Long and short runs", tables(runs, cells), (), arguments.output)
     if arguments.plot is not None:
-        draw_curves(runs, cells).savefig(arguments.plot, dpi=110)
+        arguments.plot.write_bytes(draw_curves(runs, cells))
 
 
 def read_arguments() -> Namespace:

@@ -115,20 +115,6 @@ class Stability:
         say(f"Wrote {self.output}: {len(rows)} scenes, {len(worse)} of them beyond what float32 inputs allow")
 
 
-@dataclass
-class BenchPictures:
-    """Draw the worst held-out views of a run: photograph, render, error, f_view alone, residual, overdraw."""
-
-    load_config: Path  # config.yml of a trained run.
-    output_dir: Path = Path("pictures")  # Folder for the PNG files and pictures.json.
-    views: int = 2  # Number of worst views.
-
-    def run(self) -> None:
-        from bitymi_ns.measure.pictures import draw_worst
-
-        draw_worst(self.load_config, self.output_dir, self.views)
-
-
 def _suite(name: str, description: str) -> object:
     return tyro.conf.subcommand(name, default=BenchRun(data=tyro.MISSING, suite=name), description=description)
 
@@ -138,13 +124,12 @@ Which = (
     | Annotated[BenchRun, _suite("mipnerf360", "Mip-NeRF 360: images_4 outdoors, images_2 indoors.")]
     | Annotated[BenchRun, _suite("tanksandtemples", "Tanks and Temples: train and truck.")]
     | Annotated[BenchRun, _suite("nerf-synthetic", "NeRF-Synthetic: eight objects on white.")]
-    | Annotated[BenchPictures, tyro.conf.subcommand("pictures")]
 )
 
 
 @dataclass
 class Bench:
-    """Benchmarks: a matrix of scenes, methods and seeds; pictures of a run."""
+    """Benchmarks: a matrix of scenes, methods and seeds."""
 
     what: Which
 

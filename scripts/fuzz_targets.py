@@ -38,7 +38,7 @@ from bitymi_ns.sample import generate
 from bitymi_ns.scene.config import SceneConfig
 from tests.captures import as_binary, colmap_model
 from tests.hostile import parts, saved
-from tests.measure.report.conftest import POSES, cell
+from tests.measure.report.conftest import cell
 from tests.plugin.run.test_checkpoints import moved, state
 
 CUT = b"\n--8<--\n"  # separates the files of an input
@@ -220,13 +220,13 @@ def report(work: Path) -> Target:
     point = {"step": 10, "seconds": 1.0, "cpu_seconds": 2.0, "surfels": 10, "fragments": 5, "psnr": 20.0}
     point |= {"scene": "a", "method": "bitymi"}
     train = cell("train", {"seconds": 1.0, "steps": 10, "curve": "named/curve.jsonl"})
-    cells = [train, cell("eval", evaluation), cell("export", {"bytes": 9}, "bc7"), cell("eval", evaluation, "bc7")]
-    cells.append(cell("pictures", {"folder": "named"}))
-    pictures = {"bitymi_pictures": 1, "scene": "a", "method": "b", "captions": {"final": "x"}}
-    pictures |= {"views": [{"view": 0, "rank": 1, "of": 2, "metrics": {"psnr": 1.0}, "files": {"final": "a.png"}}]}
-    seeds = {"eval.json": [evaluation], "curve.jsonl": [point, point], "cells.jsonl": cells, "report.json": [POSES]}
-    seeds["pictures.json"] = [pictures]
-    Image.new("RGB", (4, 4)).save(work / "a.png")
+    cells = [
+        train,
+        cell("eval", evaluation),
+        cell("export", {"bytes": 9}, "bc7"),
+        cell("eval", {**evaluation, "pictures": "named"}, "bc7"),
+    ]
+    seeds = {"eval.json": [evaluation], "curve.jsonl": [point, point], "cells.jsonl": cells}
     names = list(seeds)
 
     def run(data: bytes) -> None:

@@ -28,7 +28,7 @@ BESIDE = [
     "trust",
 ]
 """Modules beside the layers (ORDER, innermost first); these import no layer."""
-KNOW_NERFSTUDIO = ("plugin", "measure/pictures.py")
+KNOW_NERFSTUDIO = ("plugin",)
 
 
 def name_of(path: Path) -> str:

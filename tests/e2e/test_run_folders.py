@@ -14,7 +14,6 @@ import torch
 from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.capture.frame import WorldFrame, write_frame
-from bitymi_ns.measure.report.page import build
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import run_folder
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
@@ -110,7 +109,5 @@ def test_a_run_keeps_how_its_poses_were_found(start: Start, room: Path, tmp_path
     config.max_num_iterations = 1
     ns_train.main(config)
     shutil.rmtree(capture)
-    page = build([config.get_base_dir()], tmp_path / "report").read_text("utf8")
-    assert "12 of 14" in page and "a.jpg" in page and "blurred" in page
     kept = (config.get_base_dir() / "poses").iterdir()
     assert sorted(path.name for path in kept) == ["frame.json", "report.json"]

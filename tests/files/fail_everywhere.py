@@ -33,7 +33,6 @@ from bitymi_ns.capture.nerfstudio import write_capture
 from bitymi_ns.capture.report import FILES
 from bitymi_ns.capture.types import FoundPoses
 from bitymi_ns.files import complete_folder, write_errors_as
-from bitymi_ns.measure.pictures import draw_worst
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.export.mesh import ExportMesh
@@ -52,7 +51,7 @@ CASES = [
     (errno.EMFILE, OPEN | FOLDER | READ, 0),
 ]
 SOME = 2  # accesses tried per case by default
-SLOW = ("sample", "bundle", "mesh", "maps", "pictures", "eval")  # one access only
+SLOW = ("sample", "bundle", "mesh", "maps", "eval")  # one access only
 QUICK = ("pack", "report", "capture", "model", "checkpoint", "curve")  # every access
 GOLDEN = 0.618  # spacing of the tried accesses, as a share of all
 
@@ -269,7 +268,6 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
         "film": lambda p: lambda v: along(p, v, "a.mp4"),
         "frames": lambda p: lambda v: along(p, v, "a", output_format="images"),
         "maps": lambda p: partial(dataset, p),
-        "pictures": lambda p: lambda v: draw_worst(run, p / "a", 1 + v),
         "capture": lambda p: partial(capture, p),
         "model": lambda p: partial(model, p),
         "checkpoint": lambda p: partial(checkpoint, p),

@@ -5,10 +5,11 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.errors import Backend, against_extended, measure
-from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE, Case, cases
+from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE
 from bitymi_ns.measure.stability.scenes import PLAIN, SWEEPS, WAYS, SceneCase, Sweep, random_scene
 from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
+from tests.stress.limits import Case, cases
 
 CASES = cases()
 NAMES = [case.name for case in CASES]

@@ -47,7 +47,6 @@ class BenchRun:
     seeds: tuple[int, ...] = ()  # Train once per seed; none = once, with the method's own.
     steps: int | None = None  # Steps of a training; schedules scale with it. None = the method's own.
     formats: tuple[Format, ...] = get_args(Format)  # Bundle formats to bake each trained scene to; none = no baking.
-    pictures: int = 2  # Number of worst held-out views of each run to draw with errors and decomposition.
     work: Path = Path("outputs/bench")
     """Folder of runs, bundles, logs and finished cells, which are not run again. Several processes may share the
     folder, on different GPUs or machines: each takes runs that no other is working on."""
@@ -67,8 +66,6 @@ class BenchRun:
         """Build the matrix of these options. Raises BenchError: an option is invalid; the message says which."""
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
-        if self.pictures < 0:
-            raise BenchError("--pictures must not be negative")
         if self.plan is None:
             rows, bundles = [MethodSpec(name, name) for name in self.methods], None
         else:
@@ -79,7 +76,7 @@ class BenchRun:
         rows = [MethodSpec(row.name, row.method, (*row.options, *extra)) for row in rows]
         if bundles is None:
             bundles = [BundleSpec(name, ("--format", name)) for name in dict.fromkeys(self.formats)]
-        return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles, self.pictures)
+        return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles)
 
     def run(self) -> int:
         """Run the missing cells, print the table, and return the exit status."""

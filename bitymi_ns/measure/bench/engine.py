@@ -2,9 +2,8 @@
 folder: runs locked by another process are skipped."""
 
 import shutil
-import statistics
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from bitymi_ns.locks import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, provenance, without_nan
 from bitymi_ns.measure.bench.matrix import CellSpec, Run
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool
-from bitymi_ns.measure.report.read import PICTURES, read_jsonl
+from bitymi_ns.measure.report.read import read_jsonl
 from bitymi_ns.trust import json_of
 
 CURVE = "training_curve.jsonl"
@@ -33,7 +32,6 @@ def output_of(work: Path, stage: CellSpec) -> Path:
         "train": work / "runs" / run,
         "export": work / "bundles" / run / stage.form,
         "eval": work / "evals" / run / f"{stage.form}.json",
-        "pictures": work / "pictures" / run,
     }[stage.kind]
 
 
@@ -62,12 +60,10 @@ def stage_command(work: Path, stage: CellSpec) -> list[str]:
         assert stage.bundle is not None
         command = [tool("ns-export"), "bitymi-atlas", "--load-config", str(config)]
         return [*command, "--output-dir", output, *stage.bundle.options]
-    if stage.kind == "eval":
-        if stage.bundle is not None:
-            config = work / "bundles" / stage.run.folder / stage.form / "config.yml"
-        return [tool("ns-eval"), "--load-config", str(config), "--output-path", output]
-    command = [tool("bitymi"), "bench", "pictures", "--load-config", str(config)]
-    return [*command, "--output-dir", output, "--views", str(stage.count)]
+    if stage.bundle is not None:
+        config = work / "bundles" / stage.run.folder / stage.form / "config.yml"
+    pictures = str(output_of(work, stage).with_suffix(""))
+    return [tool("ns-eval"), "--load-config", str(config), "--output-path", output, "--render-output-path", pictures]
 
 
 def read_result(work: Path, stage: CellSpec) -> dict[str, Any]:
@@ -75,14 +71,13 @@ def read_result(work: Path, stage: CellSpec) -> dict[str, Any]:
 
     train: `steps`, `seconds` and `cpu_seconds` of the training steps only (no loading, evaluation or saving),
     `surfels`, `fragments`, `curve`. export: `bytes`, `files`, `format` and `statistics` of the bundle. eval:
-    nerfstudio's `results`, means over the held-out views. pictures: the number of `views`. All but eval: the `folder`.
-    Raises CommandFailed: there are no readable figures."""
-    readers = {"train": _train, "export": _export, "eval": _evaluation, "pictures": _pictures}
+    nerfstudio's `results`, means over the held-out views, and the folder of their `pictures`. Raises CommandFailed:
+    there are no readable figures."""
+    readers = {"train": _train, "export": _export, "eval": _evaluation}
     try:
-        figures = readers[stage.kind](output_of(work, stage), stage)
+        return without_nan(readers[stage.kind](output_of(work, stage), stage))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CommandFailed(f"{stage}: the command left no figures that can be read: {error}") from error
-    return without_nan(figures if stage.kind == "eval" else {**figures, "folder": output_of(Path(), stage).as_posix()})
 
 
 def _train(folder: Path, stage: CellSpec) -> dict[str, Any]:
@@ -112,11 +107,7 @@ def _evaluation(file: Path, stage: CellSpec) -> dict[str, Any]:
     results = json_of(file.read_text("utf8"))["results"]
     if not isinstance(results, dict) or "psnr" not in results:
         raise ValueError("no psnr in it")
-    return {"results": results}
-
-
-def _pictures(folder: Path, stage: CellSpec) -> dict[str, Any]:
-    return {"views": len(json_of((folder / PICTURES).read_text("utf8"))["views"])}
+    return {"results": results, "pictures": output_of(Path(), stage).with_suffix("").as_posix()}
 
 
 def _needs(stage: CellSpec, other: CellSpec) -> bool:
@@ -201,8 +192,8 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
         say(f"{done} of {total} cells are finished already")
 
     def announce(stage: CellSpec) -> None:
-        left = [other for chain in chains for other in missing(chain, cells)]
-        say(f"{stage} ({total - len(left) + 1} of {total}{time_left(left, cells)})")
+        left = sum(len(missing(chain, cells)) for chain in chains)
+        say(f"{stage} ({total - left + 1} of {total})")
 
     failures: list[str] = []
     for chain in chains:
@@ -213,23 +204,3 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
         except CommandFailed as error:
             failures.append(str(error))
     return failures
-
-
-def time_left(stages: Iterable[CellSpec], cells: Cells) -> str:
-    """Describe the estimated time left for `stages`, in words that end a message: each cell takes the mean of finished
-    cells of its kind, scene and number of steps, else of its kind; empty if a kind has none."""
-    known: dict[tuple, list[float]] = {}
-    for cell in cells:
-        key, seconds = cell["key"], cell.get("made", {}).get("seconds")
-        if isinstance(seconds, (int, float)):
-            kind = (key.get("cell"), key.get("bundle"))
-            for alike in (kind, (*kind, key.get("scene"), key.get("steps"))):
-                known.setdefault(alike, []).append(seconds)
-    total = 0.0
-    for stage in stages:
-        kind = (stage.kind, stage.bundle.name if stage.bundle else None)
-        alike = known.get((*kind, stage.run.scene.name, stage.run.steps)) or known.get(kind)
-        if not alike:
-            return ""
-        total += statistics.fmean(alike)
-    return f", about {total / 60:.0f} min left" if total < 5400 else f", about {total / 3600:.1f} h left"

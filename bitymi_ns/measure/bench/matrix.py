@@ -17,7 +17,7 @@ from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 from bitymi_ns.trust import inside
 
-Kind = Literal["train", "eval", "export", "pictures"]
+Kind = Literal["train", "eval", "export"]
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Run:
 
     @property
     def folder(self) -> str:
-        """Path below runs/, bundles/, evals/, pictures/ and logs/ of the work folder."""
+        """Path below runs/, bundles/, evals/ and logs/ of the work folder."""
         return f"{self.scene.name}/{self.row.method}/{self.name}"
 
     def __str__(self) -> str:
@@ -101,7 +101,6 @@ class CellSpec:
     run: Run
     kind: Kind
     bundle: BundleSpec | None = None
-    count: int = 0  # pictures: number of views
 
     @property
     def key(self) -> dict[str, Any]:
@@ -109,8 +108,6 @@ class CellSpec:
         key: dict[str, Any] = {"cell": self.kind, **self.run.key}
         if self.bundle is not None:
             key |= {"bundle": self.bundle.name, "export": list(self.bundle.options)}
-        if self.kind == "pictures":
-            key["views"] = self.count
         return key
 
     @property
@@ -120,7 +117,7 @@ class CellSpec:
 
     def __str__(self) -> str:
         what = {"train": "training", "eval": f"evaluation ({self.form})", "export": f"export ({self.form})"}
-        return f"{self.run}: {what.get(self.kind, self.kind)}"
+        return f"{self.run}: {what[self.kind]}"
 
 
 @dataclass(frozen=True)
@@ -132,7 +129,6 @@ class Matrix:
     seeds: Sequence[int] = ()  # empty: once, with the method's own seed
     steps: int | None = None  # length of a run; None: the method's own for this machine
     bundles: Sequence[BundleSpec] = field(default_factory=tuple)
-    pictures: int = 0  # number of worst held-out views to draw with their decomposition
 
     def runs(self) -> list[Run]:
         seeds = list(self.seeds) or [None]
@@ -141,12 +137,8 @@ class Matrix:
     def stages(self, run: Run) -> list[CellSpec]:
         """List the cells of a run in the order of their dependencies."""
         stages = [CellSpec(run, "train"), CellSpec(run, "eval")]
-        if not run.row.ours:
-            return stages
-        for bundle in self.bundles:
+        for bundle in self.bundles if run.row.ours else ():
             stages += [CellSpec(run, "export", bundle), CellSpec(run, "eval", bundle)]
-        if self.pictures:
-            stages.append(CellSpec(run, "pictures", count=self.pictures))
         return stages
 
     def chains(self) -> list[list[CellSpec]]:

@@ -1,11 +1,12 @@
 """Images embedded in a report: the best, median and worst held-out views that `ns-eval --render-output-path` wrote
-(photograph, render, error; side by side if folders show the same photographs), and plots of estimated poses."""
+(photograph, render, error; side by side if folders show the same photographs)."""
 
 import hashlib
 import io
 import math
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.measure.report.read import SIDE_BY_SIDE
 from bitymi_ns.safe_reading import open_regular
 
+SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
+"""File name stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
 ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
 MAX_SETS = 4  # sets of photographs per page
-MAX_WORST = 16  # worst views per page
 MAX_WIDTH = 1200  # of embedded images, pixels
 MAX_PNG_BYTES = 400_000  # larger images are embedded as JPEG of quality 92
 _RANKS = (("Worst view", 0.0), ("Median view", 0.5), ("Best view", 1.0))
@@ -55,50 +56,27 @@ class _Render:
 
 
 def open_image(path: Path) -> Image.Image:
-    """Read an image as RGB, or as RGBA if it has transparency. Raises OSError: the file is not a readable image."""
+    """Read an image as RGB. Raises OSError: the file is not a readable image."""
     open_regular(path).close()
     try:
         with Image.open(path, formats=("PNG", "JPEG")) as opened:
-            return opened.convert("RGBA" if "A" in opened.getbands() or "transparency" in opened.info else "RGB")
+            return opened.convert("RGB")
     except (OSError, MemoryError):
         raise
     except Exception as error:  # Pillow raises many kinds on broken files
         raise OSError(str(error)) from error
 
 
-def encode(image: Image.Image, caption: str) -> Picture:
-    """Scale an image down if it is wide, and encode it."""
+def _encode(pixels: Pixels, caption: str) -> Picture:
+    """Scale an image [H, W, 3] in [0, 1] down if it is wide, and encode it."""
+    image = Image.fromarray((pixels * 255.0).round().astype(np.uint8))
     image.thumbnail((MAX_WIDTH, image.height), Image.LANCZOS)
     buffer, mime = io.BytesIO(), "image/png"
     image.save(buffer, "PNG")
-    if buffer.tell() > MAX_PNG_BYTES and image.mode == "RGB":
+    if buffer.tell() > MAX_PNG_BYTES:
         buffer, mime = io.BytesIO(), "image/jpeg"
         image.save(buffer, "JPEG", quality=92, subsampling=0)
     return Picture(caption, mime, buffer.getvalue(), image.width, image.height)
-
-
-def encode_files(files: Sequence[tuple[str, Path]], notes: list[str]) -> tuple[Picture, ...]:
-    """Encode captioned files; appends a note for each that cannot be read."""
-    pictures = []
-    for caption, path in files:
-        try:
-            pictures.append(encode(open_image(path), caption))
-        except OSError as error:
-            notes.append(f"{path} is not an image that can be read: {error}.")
-    return tuple(pictures)
-
-
-def worst_views(views: Mapping[str, Sequence[tuple[str, Path]]], notes: list[str]) -> list[Group]:
-    """Encode the images of the worst views, one group per view."""
-    if len(views) > MAX_WORST:
-        notes.append(f"{len(views) - MAX_WORST} more worst views are not shown; the page holds {MAX_WORST}.")
-    read = {title: encode_files(files, notes) for title, files in list(views.items())[:MAX_WORST]}
-    return [Group(title, tuple((picture,) for picture in pictures)) for title, pictures in read.items() if pictures]
-
-
-def heat(values: Pixels, scale: float) -> Pixels:
-    """Map [H, W] values to colours [H, W, 3]: black at 0, yellow at `scale` and above."""
-    return matplotlib.colormaps["inferno"](np.clip(values / scale, 0.0, 1.0))[..., :3].astype(np.float32)
 
 
 def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
@@ -117,61 +95,47 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
         except OSError as error:
             notes.append(f"{path} is not an image that can be shown: {error}.")
             continue
+        squared = float(np.mean((photograph - render) ** 2, dtype=np.float64))
         digest = hashlib.sha256(photograph.tobytes()).digest()
-        folders.setdefault(path.parent, {})[int(match["index"])] = _Render(path, _psnr(photograph, render), digest)
-    groups: dict[tuple, list[Path]] = {}
+        of_folder = folders.setdefault(path.parent, {})
+        of_folder[int(match["index"])] = _Render(path, -10.0 * math.log10(max(1e-10, squared)), digest)
+    sets: dict[tuple, list[Path]] = {}
     for folder, renders in folders.items():
-        groups.setdefault(tuple((index, r.digest) for index, r in renders.items()), []).append(folder)
-    if len(groups) > MAX_SETS:
-        notes.append(f"Views of {len(groups) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
-    names = _titles(list(folders))
-    ordered = [sorted(g, key=names.__getitem__) for g in groups.values()]
-    return [view for group in ordered[:MAX_SETS] for view in _compared(group, folders, names, len(ordered) > 1)]
-
-
-def _titles(folders: list[Path]) -> dict[Path, str]:
-    if len(folders) < 2:
-        return {folder: folder.name for folder in folders}
-    shared = os.path.commonpath(folders)
-    return {folder: os.path.relpath(folder, shared) if str(folder) != shared else folder.name for folder in folders}
+        sets.setdefault(tuple((index, r.digest) for index, r in renders.items()), []).append(folder)
+    if len(sets) > MAX_SETS:
+        notes.append(f"Views of {len(sets) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
+    shared = os.path.commonpath(folders) if len(folders) > 1 else ""
+    groups = []
+    for members in list(sets.values())[:MAX_SETS]:
+        names = {os.path.relpath(f, shared) if shared not in ("", str(f)) else f.name: folders[f] for f in members}
+        groups += _compared(dict(sorted(names.items())), len(sets) > 1)
+    return groups
 
 
 def _halves(path: Path) -> tuple[Pixels, Pixels]:
     """Read photograph and render, [H, W, 3] in [0, 1], from an image of both."""
-    pixels = np.asarray(open_image(path).convert("RGB"), np.float32) / 255.0
+    pixels = np.asarray(open_image(path), np.float32) / 255.0
     width = pixels.shape[1] // 2
     if pixels.shape[1] != 2 * width or width == 0:
         raise OSError(f"its width of {pixels.shape[1]} pixels is not that of two equal pictures")
     return pixels[:, :width], pixels[:, width:]
 
 
-def _psnr(a: Pixels, b: Pixels) -> float:
-    return 10.0 * math.log10(1.0 / max(1e-10, float(np.mean((a - b) ** 2, dtype=np.float64))))
-
-
-def _compared(
-    group: list[Path], folders: dict[Path, dict[int, _Render]], names: dict[Path, str], named: bool
-) -> list[Group]:
-    renders = [folders[folder] for folder in group]
-    ranked = sorted(renders[0], key=lambda index: sum(r[index].psnr for r in renders))
+def _compared(folders: dict[str, dict[int, _Render]], named: bool) -> list[Group]:
+    """Encode the views of folders that show the same photographs; `named`: the folders are in the titles."""
+    first = next(iter(folders.values()))
+    ranked = sorted(first, key=lambda index: sum(renders[index].psnr for renders in folders.values()))
     chosen: dict[int, str] = {}
-    for name, quantile in _RANKS:
-        chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], name)
-    views, title = [], f"{', '.join(names[folder] for folder in group)}: " if named else ""
-    for index, name in chosen.items():
-        columns = []
-        for folder, files in zip(group, renders, strict=True):
-            photograph, render = _halves(files[index].path)
-            if not columns:
-                columns.append((encode(_image(photograph), "photograph"),))
-            error = heat(np.abs(photograph - render).mean(-1), ERROR_SCALE)
-            caption = f"{names[folder]}: {files[index].psnr:.2f} dB"
-            columns.append((encode(_image(render), caption), encode(_image(error), f"error of {names[folder]}")))
-        if len(group) == 1:
-            columns = [(picture,) for column in columns for picture in column]
-        views.append(Group(f"{title}{name} of {len(ranked)}: number {index}", tuple(columns)))
+    for rank, quantile in _RANKS:
+        chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], rank)
+    views, title = [], f"{', '.join(folders)}: " if named else ""
+    for index, rank in chosen.items():
+        columns = [(_encode(_halves(first[index].path)[0], "photograph"),)]
+        for name, renders in folders.items():
+            photograph, render = _halves(renders[index].path)
+            error = np.clip(np.abs(photograph - render).mean(-1) / ERROR_SCALE, 0.0, 1.0)
+            heat = matplotlib.colormaps["inferno"](error)[..., :3].astype(np.float32)
+            drawn = _encode(render, f"{name}: {renders[index].psnr:.2f} dB"), _encode(heat, f"error of {name}")
+            columns += [drawn] if len(folders) > 1 else [(picture,) for picture in drawn]
+        views.append(Group(f"{title}{rank} of {len(ranked)}: number {index}", tuple(columns)))
     return views
-
-
-def _image(pixels: Pixels) -> Image.Image:
-    return Image.fromarray((pixels * 255.0).round().astype(np.uint8))

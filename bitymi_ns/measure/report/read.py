@@ -1,8 +1,6 @@
-"""Readers of a report's inputs: ns-eval files, training curves, benchmark cells, images, estimated poses, and folders
-of these."""
+"""Readers of a report's inputs: ns-eval files, training curves, benchmark cells, images, and folders of these."""
 
 import os
-import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -12,6 +10,7 @@ from typing import Any, NoReturn
 from bitymi_ns.measure.bench.cells import FILE as CELLS
 from bitymi_ns.measure.bench.cells import Cells, identity
 from bitymi_ns.measure.bench.process import BenchError
+from bitymi_ns.measure.report.pictures import SIDE_BY_SIDE
 from bitymi_ns.measure.report.records import (
     Curve,
     Evaluation,
@@ -21,23 +20,14 @@ from bitymi_ns.measure.report.records import (
     evaluation_from,
     link,
 )
-from bitymi_ns.measure.report.tables import COLUMNS, FITTED
 from bitymi_ns.safe_reading import read_text as text_of
 from bitymi_ns.safe_reading import reading
 from bitymi_ns.trust import finite_numbers, json_of
 
-PICTURES = "pictures.json"
 MAX_BYTES = 64 << 20  # larger files are not evaluations
 MAX_DEPTH = 8  # levels of folders that are searched
-SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
-"""File name stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
-
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
-_NOT_OF_A_RUN = ("cell", "bundle", "export", "views")
-_POSES = {"source", "registered", "given", "reprojection_error", "track_length", "left_out", "seconds"}
-
-
-# text and JSON
+_NOT_OF_A_RUN = ("cell", "bundle", "export", "pictures", "views")
 
 
 def parse_json(text: str, where: str) -> Any:
@@ -59,8 +49,13 @@ def _refuse(message: str, cause: BaseException) -> NoReturn:
     raise ReportError(message) from cause
 
 
-def read_lines(path: Path) -> tuple[list[Any], list[str]]:
-    """Read the values of a JSONL file; also returns notes.
+def is_evaluation(data: Any) -> bool:
+    """Return True for ns-eval's JSON."""
+    return isinstance(data, dict) and isinstance(data.get("results"), dict)
+
+
+def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
+    """Read evaluations, curve and notes of a JSONL file; empty if it holds something else.
 
     A truncated last line (of a killed run) is skipped with a note. Raises ReportError: another line is broken."""
     numbered = [(i, s) for i, s in enumerate(read_text(path).splitlines(), 1) if s.strip()]
@@ -72,47 +67,9 @@ def read_lines(path: Path) -> tuple[list[Any], list[str]]:
             if position + 1 < len(numbered) or position == 0:
                 raise
             notes.append(f"{path}: the last line is cut off and was left out.")
-    return values, notes
-
-
-# single records
-
-
-def is_evaluation(data: Any) -> bool:
-    """Return True for ns-eval's JSON."""
-    return isinstance(data, dict) and isinstance(data.get("results"), dict)
-
-
-def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
-    """Read evaluations, curve and notes of a JSONL file; empty if it holds something else."""
-    values, notes = read_lines(path)
     evaluations = [evaluation_from(value, path) for value in values if is_evaluation(value)]
     points = [v for v in values if isinstance(v, dict) and "step" in finite_numbers(v) and not is_evaluation(v)]
     return evaluations, [curve_from(points, path)] if points else [], notes
-
-
-def picture_files(path: Path, run: str = "") -> dict[str, list[tuple[str, Path]]]:
-    """Read the worst views listed in a pictures.json, as in `Records`; empty if the file is something else. Raises
-    ReportError: it is not valid JSON, or its views are malformed."""
-    data = parse_json(read_text(path), str(path))
-    if not isinstance(data, dict) or "bitymi_pictures" not in data:
-        return {}
-    scene, method = str(data.get("scene") or "unnamed scene"), run or str(data.get("method") or "")
-    views = {}
-    try:
-        for view in data["views"]:
-            metrics = finite_numbers(view["metrics"])
-            figures = [f"{c.title} {c.text(metrics[c.key])}" for c in (*COLUMNS, *FITTED) if c.key in metrics]
-            rank = "worst" if view["rank"] == 1 else f"number {view['rank']} from below"
-            title = f"{scene}, {method}: view {view['view']}, {rank} of {view['of']}: {', '.join(figures)}"
-            files = view["files"].items()
-            views[title] = [(data["captions"].get(kind, kind), path.parent / Path(name).name) for kind, name in files]
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ReportError(f"{path} does not list its views as bitymi bench pictures does: {error!r}.") from error
-    return views
-
-
-# cells of a benchmark
 
 
 def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
@@ -148,27 +105,25 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
     figures = finite_numbers(train)
     times = {f"train_{k}": figures[k] for k in ("seconds", "cpu_seconds", "peak_bytes") if k in figures}
     for (kind, bundle), value in cells.items():
+        if kind != "eval":
+            continue
         try:
-            if kind == "eval":
-                size = cells.get(("export", bundle), {}).get("bytes")
-                results = finite_numbers({**value["results"], **times, "bundle_bytes": size})
-                if "psnr" not in results:
-                    raise KeyError("psnr among its results")
-                group = f"{trained.method}, {bundle}" if bundle else trained.method
-                own = {"baked": bool(bundle), "label": group + suffix, "group": group}
-                records.evaluations.append(replace(trained, results=results, **own))
-            elif kind == "pictures" and os.path.isfile(listed := folder / value["folder"] / PICTURES):
-                records.worst |= picture_files(listed, trained.label)
-        except (KeyError, TypeError, AttributeError) as error:
+            size = cells.get(("export", bundle), {}).get("bytes")
+            results = finite_numbers({**value["results"], **times, "bundle_bytes": size})
+            if "psnr" not in results:
+                raise KeyError("psnr among its results")
+            pictures = sorted((folder / value["pictures"]).glob("eval_img_*.png")) if value.get("pictures") else []
+        except (KeyError, TypeError, AttributeError, ValueError, OSError) as error:
             raise ReportError(f"{trained.source}: the {kind} cell of {trained.method} lacks {error}.") from error
+        group = f"{trained.method}, {bundle}" if bundle else trained.method
+        own = {"baked": bool(bundle), "label": group + suffix, "group": group}
+        records.evaluations.append(replace(trained, results=results, **own))
+        records.images += pictures
     curve = folder / str(train["curve"]) if train.get("curve") else None
     if curve is not None and os.path.isfile(curve):
         _, curves, notes = read_jsonl(curve)
         records.curves += [replace(c, scene=trained.scene, label=trained.label, run=trained.run) for c in curves]
         records.notes += notes
-
-
-# files and folders
 
 
 def _walk(folder: Path, skip: Path) -> Iterator[Path]:
@@ -191,29 +146,22 @@ def _walk(folder: Path, skip: Path) -> Iterator[Path]:
 
 def _read(path: Path, records: Records) -> bool:
     """Add the records of a file; return False if it has none."""
-    before = sum(map(len, vars(records).values())) - len(records.notes)
+    before = len(records.images) + len(records.evaluations) + len(records.curves)
     if path.suffix.lower() == ".png":
         records.images.append(path)
-    elif path.name == PICTURES:
-        records.worst |= picture_files(path)
+    elif path.name == CELLS:
+        try:
+            add_cells(Cells(path), path, records)
+        except BenchError as error:
+            raise ReportError(str(error)) from error
     elif path.suffix.lower() == ".jsonl":
-        if path.name == CELLS:
-            try:
-                add_cells(Cells(path), path, records)
-            except BenchError as error:
-                raise ReportError(str(error)) from error
-        else:
-            evaluations, curves, notes = read_jsonl(path)
-            records.evaluations += evaluations
-            records.curves += curves
-            records.notes += notes
-    else:
-        data = parse_json(read_text(path), str(path))
-        if isinstance(data, dict) and data.keys() >= _POSES:
-            records.poses[path] = data
-        elif is_evaluation(data):
-            records.evaluations.append(evaluation_from(data, path))
-    return sum(map(len, vars(records).values())) - len(records.notes) > before
+        evaluations, curves, notes = read_jsonl(path)
+        records.evaluations += evaluations
+        records.curves += curves
+        records.notes += notes
+    elif is_evaluation(data := parse_json(read_text(path), str(path))):
+        records.evaluations.append(evaluation_from(data, path))
+    return len(records.images) + len(records.evaluations) + len(records.curves) > before
 
 
 def collect(inputs: list[Path], output_dir: Path) -> Records:
@@ -237,7 +185,7 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
             if path.resolve() not in seen and not _read(path, records):
                 raise ReportError(
                     f"{path} holds neither an evaluation (a JSON object with 'results', as ns-eval writes it) "
-                    "nor a training curve (JSON lines with 'step') nor lines of bitymi bench, nor how poses were found."
+                    "nor a training curve (JSON lines with 'step') nor lines of bitymi bench."
                 )
             seen.add(path.resolve())
             continue
@@ -251,7 +199,7 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
                 _read(file, records)
             except ReportError as error:
                 records.notes.append(str(error))
-    if not (records.evaluations or records.curves or records.worst or records.poses):
+    if not (records.evaluations or records.curves):
         where = ", ".join(map(str, paths)) or "no inputs"
         more = "".join(f"\n  {note}" for note in records.notes)
         raise ReportError(

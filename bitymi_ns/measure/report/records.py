@@ -1,4 +1,4 @@
-"""Records of a report and the links between them: evaluations, training curves, worst views, estimated poses."""
+"""Records of a report and the links between them: evaluations, training curves."""
 
 import re
 import statistics
@@ -33,10 +33,6 @@ class Evaluation:
     series: str = ""  # run without the seed
     seed: int | None = None  # of the training, None if not stated
 
-    def get(self, key: str) -> float | None:
-        """Return a result; None if it is missing or was not finite."""
-        return self.results.get(key)
-
 
 @dataclass(frozen=True)
 class Curve:
@@ -65,9 +61,6 @@ class Records:
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
     images: list[Path] = field(default_factory=list)  # photographs beside renders, as ns-eval writes them
-    worst: dict[str, list[tuple[str, Path]]] = field(default_factory=dict)  # title of a view -> (caption, file)
-    # path of a report.json of estimated poses -> content; an image of the cameras is beside it
-    poses: dict[Path, dict[str, Any]] = field(default_factory=dict)
     machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -156,11 +149,11 @@ def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
 
 def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:
     """Compute the PSNR of a bundle minus that of its trained scene; None if unknown."""
-    known = row.get("psnr_delta")
+    known = row.results.get("psnr_delta")
     if known is not None:
         return known
     parent = trained_parent(row, evaluations)
-    before, after = (parent.get("psnr") if parent else None), row.get("psnr")
+    before, after = (parent.results.get("psnr") if parent else None), row.results.get("psnr")
     return None if before is None or after is None else after - before
 
 

@@ -1,10 +1,9 @@
 """Tables of a report; their HTML is in templates/report.html.j2."""
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
-from bitymi_ns.capture.report import overview
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.markdown import escaped
 from bitymi_ns.measure.report.records import Curve, Evaluation, psnr_delta
@@ -137,7 +136,7 @@ def _rows(evaluations: list[Evaluation], columns: list[Column]) -> list[Row]:
     texts = []
     best: list[set[int]] = [set() for _ in evaluations]
     for j, column in enumerate(columns, 1):
-        values = [row.get(column.key) for row in evaluations]
+        values = [row.results.get(column.key) for row in evaluations]
         written = [MISSING if v is None else column.text(v) for v in values]
         texts.append(written)
         known = [v for v in values if v is not None]
@@ -219,22 +218,6 @@ def quality_tables(evaluations: list[Evaluation], training: bool = False) -> lis
             tables.append(scene_table(scene + what, [row for row in rows if row.scene == scene], columns))
         mean = mean_table(rows, columns)
         tables += [replace(mean, title=mean.title + what)] if mean else []
-    return tables
-
-
-MOST_NAMED = 60  # maximum number of photographs in a table; report.json lists all
-
-
-def poses_tables(values: Mapping[str, Any]) -> list[Table]:
-    """Build the tables of a capture's camera poses: statistics, photographs left out, and notes."""
-    tables = [Table("Poses", ("", str(values["source"])), tuple(map(Row, overview(values).items())))]
-    for key, title, header in (("left_out", "Left out", "Why"), ("notes", "Notes", "")):
-        named = values.get(key)
-        if isinstance(named, dict) and named:
-            rows = [Row((name, str(why))) for name, why in list(named.items())[:MOST_NAMED]]
-            more = len(named) - len(rows)
-            note = f"And {more:,} more, which report.json names." if more else ""
-            tables.append(Table(f"{title}: {len(named):,}", ("Photograph", header), tuple(rows), note))
     return tables
 
 

@@ -12,7 +12,7 @@ from bitymi_ns.cli import main
 from bitymi_ns.locks import Lock
 from bitymi_ns.measure.bench import engine
 from bitymi_ns.measure.bench.cells import Cells, identity
-from bitymi_ns.measure.bench.engine import run_chains, time_left
+from bitymi_ns.measure.bench.engine import run_chains
 from bitymi_ns.measure.bench.matrix import CellSpec, Matrix, MethodSpec
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, tool
 
@@ -25,10 +25,9 @@ def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matri
     work = tmp_path / "work"
     assert run_chains(work, matrix.chains()) == []
     cells = lines(work)
-    assert len(cells) == 20 and len({identity(c["key"]) for c in cells}) == 20
-    kinds = [c["key"]["cell"] for c in cells[:5]]
-    assert kinds == ["train", "eval", "export", "eval", "pictures"]
-    train = cells[5]
+    assert len(cells) == 16 and len({identity(c["key"]) for c in cells}) == 16
+    assert [c["key"]["cell"] for c in cells[:4]] == ["train", "eval", "export", "eval"]
+    train = cells[4]
     assert train["key"]["seed"] == 1 and train["key"]["steps"] == 100 and train["key"]["scene"] == "fox"
     assert train["value"]["seconds"] == 10 and train["value"]["process_cpu_seconds"] > 0
     assert (work / train["value"]["curve"]).is_file()
@@ -42,24 +41,23 @@ def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matri
 
 def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: Matrix, tmp_path: Path) -> None:
     run_chains(tmp_path / "work", matrix.chains()[1:2])
-    train, trained, export, baked, pictures = fakes.calls()
+    train, trained, export, baked = fakes.calls()
     assert train.startswith("ns-train bitymi ") and train.endswith("captures/fox")
     for words in ("--machine.seed 1", "--pipeline.model.train.seed 1", "--max-num-iterations 100", "--vis none"):
         assert words in train
     assert export.startswith("ns-export bitymi-atlas --load-config ") and export.endswith("--format bc7")
     assert trained.startswith("ns-eval --load-config ") and "/bundles/" in baked
-    assert pictures.startswith("bitymi bench pictures ")
 
 
 def test_finished_cells_are_skipped(fakes, matrix: Matrix, tmp_path: Path) -> None:
     run_chains(tmp_path / "work", matrix.chains())
     fakes.calls()
-    renamed = Matrix(matrix.scenes, [MethodSpec("another name", "bitymi")], (0, 1), 100, matrix.bundles, 1)
+    renamed = Matrix(matrix.scenes, [MethodSpec("another name", "bitymi")], (0, 1), 100, matrix.bundles)
     assert run_chains(tmp_path / "work", matrix.chains()) == run_chains(tmp_path / "work", renamed.chains()) == []
     assert fakes.calls() == []
 
 
-@pytest.mark.parametrize("at", [0, 2, 4])
+@pytest.mark.parametrize("at", [0, 2, 3])
 def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
     work, chain = tmp_path / "work", matrix.chains()[0]
     calls = iter(range(99))
@@ -79,7 +77,7 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
     fakes.calls()
     monkeypatch.setattr(engine, "run_measured", run_measured)
     assert run_chains(work, [chain]) == []
-    assert len(fakes.calls()) == 5 - at and len(lines(work)) == 5
+    assert len(fakes.calls()) == 4 - at and len(lines(work)) == 4
 
 
 def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
@@ -87,7 +85,7 @@ def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
 ) -> None:
     work, python = tmp_path / "work", fakes.python(monkeypatch)
     words = [python, "-m", "bitymi_ns", "bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10"]
-    words += ["--formats", "bc7", "--pictures", "0", "--work", str(work)]
+    words += ["--formats", "bc7", "--work", str(work)]
     fakes.slow.write_text("ns-export")
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
@@ -126,7 +124,7 @@ def test_a_training_that_is_done_again_takes_its_cells_with_it(fakes, matrix: Ma
     text = (work / "cells.jsonl").read_text().splitlines(keepends=True)
     (work / "cells.jsonl").write_text("".join(text[1:]))
     run_chains(work, [chain])
-    assert len(fakes.calls()) == 5
+    assert len(fakes.calls()) == 4
     (work / "cells.jsonl").write_text("".join([*text[:2], *text[3:]]))  # without the export
     run_chains(work, [chain])
     assert [call.split()[0] for call in fakes.calls()] == ["ns-export", "ns-eval"]
@@ -140,11 +138,11 @@ def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: Matrix, tmp_path:
     assert "fox, bitymi, seed 0: training failed" in failures[0] and "status 3" in failures[0]
     assert "something is wrong with the capture" in failures[0]
     assert "export (bc7) failed" in failures[2]
-    assert len(lines(work)) == 5 + 3  # the second lego run has no export and no evaluation of it
+    assert len(lines(work)) == 4 + 2  # the second lego run has no export and no evaluation of it
     fakes.fail()
     fakes.calls()
     assert run_chains(work, matrix.chains()) == []
-    assert len(fakes.calls()) == 10 + 2
+    assert len(fakes.calls()) == 8 + 2
 
 
 def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_path: Path) -> None:
@@ -154,7 +152,7 @@ def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_p
 
 
 def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    other = Matrix(matrix.scenes[:1], [MethodSpec("splatfacto", "splatfacto")], (), 100, matrix.bundles, 1)
+    other = Matrix(matrix.scenes[:1], [MethodSpec("splatfacto", "splatfacto")], (), 100, matrix.bundles)
     assert run_chains(tmp_path / "work", other.chains()) == []
     assert [call.split()[0] for call in fakes.calls()] == ["ns-train", "ns-eval"]
     (cell, _) = lines(tmp_path / "work")
@@ -203,14 +201,3 @@ def test_runs_of_different_settings_have_different_folders(matrix: Matrix) -> No
     runs = matrix.runs()
     assert len({run.folder for run in runs}) == 4
     assert Cells(Path("/nowhere/cells.jsonl")).get(CellSpec(runs[0], "train").key) is None
-
-
-def test_the_time_left_is_that_of_the_cells_most_alike(matrix: Matrix, tmp_path: Path) -> None:
-    cells = Cells(tmp_path / "cells.jsonl")
-    fox, _, lego, _ = matrix.runs()
-    assert time_left([CellSpec(fox, "train")], cells) == ""
-    cells.add(CellSpec(lego, "train").key, {}, {"seconds": 600.0})
-    assert time_left([CellSpec(fox, "train")], cells) == ", about 10 min left"
-    cells.add(CellSpec(fox, "train").key, {}, {"seconds": 1800.0})
-    assert time_left([CellSpec(fox, "train")] * 4, cells) == ", about 2.0 h left"
-    assert time_left([CellSpec(fox, "train"), CellSpec(fox, "eval")], cells) == ""

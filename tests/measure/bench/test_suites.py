@@ -117,7 +117,7 @@ def run(*words: object) -> int:
 def test_the_command_prints_the_tables_and_skips_what_is_done(
     fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["local", "--data", capture("fox"), "--steps", 10, "--formats", "uint8", "bc7", "--pictures", 0]
+    words = ["local", "--data", capture("fox"), "--steps", 10, "--formats", "uint8", "bc7"]
     words += ["--work", tmp_path / "w", "--output", tmp_path / "table.md", "--extra=--a.b 1"]
     fakes.fail("--format uint8")
     assert run(*words) == 1
@@ -134,7 +134,7 @@ def test_a_plan_by_the_command(
     fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "p.yaml").write_text("rows: {a: {method: bitymi}, b: {method: bitymi, options: [--x]}}\nbundles: {}")
-    words = ("local", "--data", capture("fox"), "--steps", 10, "--plan", tmp_path / "p.yaml", "--pictures", 0)
+    words = ("local", "--data", capture("fox"), "--steps", 10, "--plan", tmp_path / "p.yaml")
     assert run(*words, "--work", tmp_path / "w") == 0
     assert "| b | 21.00 |" in capsys.readouterr().out and len(fakes.calls()) == 4
 
@@ -158,7 +158,6 @@ def test_ctrl_c_says_how_to_go_on(
         (("mipnerf360", "--data", "/a", "/b"), "--data is one folder"),
         (("local", "--data", "/a", "--scenes", "x"), "--scenes chooses"),
         (("local", "--data", "/a", "--steps", "0"), "--steps must be"),
-        (("local", "--data", "/a", "--pictures", "-1"), "--pictures must not"),
     ],
 )
 def test_mistakes_are_one_line(words: tuple[str, ...], reason: str, capsys: pytest.CaptureFixture[str]) -> None:

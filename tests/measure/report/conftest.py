@@ -80,22 +80,6 @@ def write_results(root: Path) -> Path:
     return root
 
 
-POSES: dict[str, Any] = {
-    "source": "/photos/garden", "given": 42, "registered": 39, "reprojection_error": 0.7312, "track_length": 4.256,
-    "points": 12_345, "parallax_degrees": 11.04, "metres_per_unit": 1.0, "gps_error": 2.34,
-    "left_out": {"IMG <1>.jpg": "no other photograph shows the same", **{f"{i:03d}.jpg": "blurred" for i in range(99)}},
-    "notes": {"IMG_3.jpg": "too dark"}, "seconds": {"finding features": 12.34, "all": 56.78},
-}  # fmt: skip
-"""report.json of pose estimation."""
-
-
-def write_poses(folder: Path, **changes: Any) -> Path:
-    folder.mkdir(parents=True)
-    (folder / "report.json").write_text(json.dumps({**POSES, **changes}))
-    Image.new("RGB", (120, 60), "white").save(folder / "cameras.png")
-    return folder / "report.json"
-
-
 def cell(kind: str, value: dict[str, Any], bundle: str = "", **key: Any) -> dict[str, Any]:
     settings = {
         "cell": kind, "suite": "local", "row": "bitymi", "scene": "fox", "data": "/data/fox", "parser": [],
@@ -117,34 +101,25 @@ def write_lines(path: Path, lines: list[dict[str, Any]]) -> Path:
 
 
 def write_work(folder: Path) -> Path:
-    """Write a work folder: two seeds of one row, baked, with pictures."""
+    """Write a work folder: two seeds of one row, baked, with pictures of one seed."""
     cells = []
     for seed, shift in ((0, 0.0), (1, 0.2)):
         curve = folder / "runs" / str(seed) / "training_curve.jsonl"
         write_lines(curve, [{"step": s, "seconds": s / 10, "psnr": 20 + s / 50} for s in (50, 100)])
         train = {"steps": 100, "seconds": 10.0 + seed, "cpu_seconds": 20.0, "surfels": 5000}
         cells.append(cell("train", {**train, "curve": f"runs/{seed}/training_curve.jsonl"}, seed=seed))
-        cells.append(cell("eval", figures(25.0 + shift, 30.0), seed=seed))
+        cells.append(cell("eval", figures(25.0 + shift, 30.0) | {"pictures": f"evals/{seed}"}, seed=seed))
         cells.append(cell("export", {"bytes": 3_000_000, "format": "bc7"}, "bc7", seed=seed))
         cells.append(cell("eval", figures(24.9 + shift, 10.0, atlas_bytes=2e6), "bc7", seed=seed))
-    pictures = folder / "pictures"
-    pictures.mkdir()
-    Image.new("RGB", (1600, 900), (200, 10, 10)).save(pictures / "v.png")
-    files = {"photo": "v.png", "final": "gone.png"}
-    view = {"view": 4, "rank": 1, "of": 7, "metrics": {"psnr": 21.5, "flip": 0.2}, "files": files}
-    listed = {"bitymi_pictures": 1, "scene": "fox", "method": "bitymi", "captions": {"photo": "the photo"}}
-    (pictures / "pictures.json").write_text(json.dumps({**listed, "views": [view]}))
-    cells.append(cell("pictures", {"folder": "pictures", "views": 1}))
+    view(folder / "evals/0/eval_img_0000.png", 0, 0.04, 0.0)
     write_lines(folder / "cells.jsonl", cells)
     return folder
 
 
 @pytest.fixture(scope="session")
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four runs, sixteen evaluations, rendered views, poses of one capture, broken files. Not to be changed."""
+    """Four runs, sixteen evaluations, rendered views, broken files. Not to be changed."""
     root = write_results(tmp_path_factory.mktemp("report") / "results")
-    for run in root.glob("outputs/*/bitymi/*"):
-        write_poses(run / "poses")
     (root / "evals" / "fox" / "broken.json").write_text('{"results": {"psnr": 2')
     (root / "renders" / "fox" / "trained" / "eval_img_0099.png").write_bytes(b"\x89PNG\r\n\x1a\nrubbish")
     return root

@@ -13,7 +13,6 @@ from PIL import Image
 
 from bitymi_ns.measure.report.page import build
 from bitymi_ns.measure.report.records import ReportError
-from tests.measure.report.conftest import POSES, write_poses
 
 PLOTS = 12
 """Plots of three metrics against three costs, and of training curves."""
@@ -55,19 +54,10 @@ def test_the_page_is_whole_and_needs_no_other_file(page: str, results: Path) -> 
     assert "LPIPS" not in re.sub("<p.*", "", page) and ">nan<" not in page.lower()
     assert [path.name for path in results.with_name("report").iterdir()] == ["index.html"]
     images = pictures(page)
-    # two scenes with three views each: photograph, two renders, two errors; and the cameras of one capture
-    assert len(images) == PLOTS + 2 * 3 * 5 + 1
+    # two scenes with three views each: photograph, two renders, two errors
+    assert len(images) == PLOTS + 2 * 3 * 5
     plots = [image for image in images if image.width > 600]
     assert len(plots) == PLOTS and all(image.convert("L").getextrema() != (255, 255) for image in plots)
-
-
-def test_found_poses_are_shown_once_for_all_runs_of_a_capture(page: str) -> None:
-    for text in ("0.73", "4.26", "12,345", "finding features", "12.3", "56.8", "/photos/garden", "too dark"):
-        assert text in page
-    assert page.count("39 of 42") == 1 and "1 capture with found poses" in page
-    assert "z up by GPS, metres by GPS (median error 2.3 m)" in page
-    assert "Left out: 100" in page and "IMG &lt;1&gt;.jpg" in page and "<1>" not in page
-    assert "058.jpg" in page and "059.jpg" not in page and "And 40 more" in page
 
 
 def test_broken_files_of_a_folder_are_noted(page: str) -> None:
@@ -77,12 +67,8 @@ def test_broken_files_of_a_folder_are_noted(page: str) -> None:
 def test_a_benchmark(work: Path, tmp_path: Path) -> None:
     page = build([work], tmp_path / "report").read_text("utf8")
     Checker(page)
-    for text in (
-        "bitymi (2 seeds)", "−0.100", "Worst views", "the photo",
-        "view 4, worst of 7: PSNR 21.50, FLIP 0.200", "Abacus, 10 beads", "gone.png is not an image",
-    ):  # fmt: skip
+    for text in ("bitymi (2 seeds)", "−0.100", "Worst view of 1: number 0", "Abacus, 10 beads"):
         assert text in page
-    assert (1200, 675) in [image.size for image in pictures(page)]
 
 
 @pytest.mark.parametrize(("count", "drawn"), [(1, 0), (2, 0), (3, 2)])
@@ -147,20 +133,3 @@ def test_foreign_page_is_not_replaced(eval_json, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(ReportError, match="file is not a folder: choose another path"):
         build([eval_json(psnr=20.0)], tmp_path / "file")
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {name: None for name in POSES},
-        {name: [1] for name in POSES},
-        {name: {"a": {}} for name in POSES},
-        {**dict.fromkeys(POSES, 10**400), "seconds": {"a": 10**400}},
-    ],
-    ids=["null", "lists", "objects", "huge"],
-)
-def test_poses_with_values_of_any_type(changes: dict[str, Any], tmp_path: Path) -> None:
-    file = write_poses(tmp_path / "poses", **changes)
-    (file.parent / "cameras.png").write_bytes(b"no picture")
-    page = build([file.parent], tmp_path / "report").read_text("utf8")
-    assert "Camera poses" in page and "cameras.png is not an image that can be read" in page

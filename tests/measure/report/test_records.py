@@ -80,7 +80,7 @@ def test_results_folder(results: Path, tmp_path: Path):
     assert {(c.scene, c.label) for c in records.curves} == {
         (scene, method) for scene in ("fox", "snowmiku") for method in ("bitymi", "bitymi-quality")
     }
-    assert len(records.images) == 29 and len(records.poses) == 2
+    assert len(records.images) == 29
     assert len(records.notes) == 1
 
 
@@ -119,7 +119,6 @@ def test_link_that_leads_back_does_not_loop(eval_json, tmp_path: Path):
 
 def test_a_work_folder_is_read_by_its_cells_alone(work: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(work, tmp_path / "work"))
-    (copy / "evals").mkdir()
     (copy / "evals" / "trained.json").write_text('{"results": {"psnr": 1.0}}')
     records = collect([tmp_path], tmp_path / "report")
     assert [e.results["psnr"] for e in records.evaluations] == pytest.approx([25.0, 24.9, 25.2, 25.1])
@@ -127,7 +126,7 @@ def test_a_work_folder_is_read_by_its_cells_alone(work: Path, tmp_path: Path) ->
     assert records.evaluations[1].results["bundle_bytes"] == 3e6
     assert records.evaluations[3].results["train_seconds"] == 11.0
     assert [c.label for c in records.curves] == ["bitymi, seed 0", "bitymi, seed 1"]
-    assert len(records.worst) == 1 and records.machines == ["Abacus, 10 beads"]
+    assert len(records.images) == 1 and records.machines == ["Abacus, 10 beads"]
     trained, baked = over_seeds(records.evaluations)
     assert trained.label == "bitymi (2 seeds)" and trained.results["psnr"] == pytest.approx(25.1)
     assert baked.results["psnr_seeds"] == pytest.approx(0.1414, abs=1e-3)
@@ -165,7 +164,6 @@ def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
             '{"key": {"cell": "eval", "scene": ["a"]}, "made": "x", "value": {"results": {"psnr": "bad"}}}',
             r"lacks 'psnr among its results'",
         ),
-        ('{"key": {"cell": "pictures"}, "value": {}}', r"the pictures cell of .* lacks 'folder'"),
         ("nonsense", r"line 2, is not a finished cell"),
     ],
 )
@@ -174,11 +172,3 @@ def test_malformed_lines_are_named(tmp_path: Path, line: str, reason: str) -> No
     (tmp_path / "cells.jsonl").write_text(f"{good}\n{line}\n{good}\n")
     with pytest.raises(ReportError, match=reason):
         collect([tmp_path / "cells.jsonl"], tmp_path / "report")
-
-
-@pytest.mark.parametrize("change", [{"views": [{}]}, {"views": 3}, {"captions": None}])
-def test_malformed_pictures_are_named(work: Path, tmp_path: Path, change: dict) -> None:
-    listed = json.loads((work / "pictures" / "pictures.json").read_text())
-    (tmp_path / "pictures.json").write_text(json.dumps({**listed, **change}))
-    with pytest.raises(ReportError, match=r"pictures\.json does not list its views"):
-        collect([tmp_path / "pictures.json"], tmp_path / "report")

@@ -13,9 +13,9 @@ from bitymi_ns.measure.stability.scenes import random_scene
 
 def test_the_page_and_its_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     short = tuple(dataclasses.replace(sweep, values=sweep.values[:1]) for sweep in page.SWEEPS)
-    every = page.cases
+    scenes = page.extreme_scenes()[:2]
     monkeypatch.setattr(page, "SWEEPS", short)
-    monkeypatch.setattr(page, "cases", lambda way: every(way)[:2])
+    monkeypatch.setattr(page, "extreme_scenes", lambda: scenes)
     target = tmp_path / "deep" / "numbers.md"
     assert cli.main(["stability", "--output", str(target)]) == 0
     text = target.read_text("utf8")

@@ -49,7 +49,7 @@ CMAKE_ARGS  := $(DEFINE).BITYMI_EMULATED_CUDA=ON \
 
 export OMP_NUM_THREADS ?= $(shell nproc 2>/dev/null || echo 1)
 
-.PHONY: setup demo test gate gate-accept wheel wheel-test test-environment sanitize clang-test baseline-test bench web web-test web-test-here lint format clean
+.PHONY: setup demo test test-all gate gate-accept wheel wheel-test test-environment sanitize clang-test baseline-test bench web web-test web-test-here lint format clean
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.stamp-build
@@ -100,9 +100,12 @@ demo: setup
 # A worker of pytest per processor, each with one thread: files of tests beside each other, the slow ones first. Fixtures
 # of a file are made once, as it stays with one worker. Tests of threads set their number themselves. Rewritten tests
 # and the package are compiled once, not by every process that tests start, hence bytecode is written.
+# test: every module in minutes; test-all: the rest, which tests marked slow are.
 test: setup web-test
-	BITYMI_TESTS_REQUIRE=emulated OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q \
-	  -n $(WORKERS) --dist loadfile --no-loadscope-reorder
+test-all: setup $(if $(shell command -v npm),web/node_modules/.package-lock.json)
+test test-all:
+	BITYMI_TESTS_REQUIRE=emulated OMP_NUM_THREADS=1 PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q --durations 20 \
+	  -n $(WORKERS) --dist loadfile --no-loadscope-reorder -m $(if $(filter test,$@),'not slow',slow)
 
 # npm records in node_modules what it installed from which lock file.
 web/node_modules/.package-lock.json: web/package-lock.json

@@ -286,6 +286,7 @@ def test_options_of_captures_are_checked(room: Path, options: dict[str, Any], me
         bitymi_ns.load_capture(room, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["bitymi-field", "bitymi-notexture"])
 def test_a_field_and_a_scene_without_texture_are_baked_too(room: Path, tmp_path: Path, method: str) -> None:
     views = bitymi_ns.load_capture(room, points="random")[0]

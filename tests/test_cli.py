@@ -42,6 +42,7 @@ def test_mistakes_are_one_line(
     assert said.startswith(error.format(tmp_path)) and said.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_what_nobody_can_act_on_is_not_said_and_nothing_is_written_elsewhere(tmp_path: Path) -> None:
     assert cli.Stability().output == Path("stability.md")  # in the current folder
     old = "warnings.warn_explicit('old', FutureWarning, 'a.py', 1, '{}.activations')"
@@ -76,6 +77,7 @@ def test_a_full_disk_and_ctrl_c_are_named(
     assert error.format(tmp_path / "room") in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["a\x1b[2Jb", "\udcff", "\rx"])
 def test_names_do_not_control_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
     (tmp_path / name).touch()

@@ -178,6 +178,7 @@ def test_work_goes_on_when_nobody_reads_its_output(tmp_path: Path) -> None:
     assert process.returncode == 0 and (tmp_path / "done").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
 def test_output_on_a_full_disk() -> None:
     with open("/dev/full", "w") as full:

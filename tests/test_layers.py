@@ -102,6 +102,7 @@ def test_no_two_modules_import_each_other() -> None:
         pytest.fail(" imports ".join(error.args[1]))
 
 
+@pytest.mark.slow
 def test_reading_a_bundle_loads_neither_the_bake_nor_the_training() -> None:
     code = (
         "import sys; from bitymi_ns.bundle import check_files, read_bundle, write_bundle; "

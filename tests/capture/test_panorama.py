@@ -114,6 +114,7 @@ def test_what_metadata_say(tmp_path: Path, suffix: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_they_get_poses_as_pictures_of_all_directions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "walk").mkdir()
@@ -139,6 +140,7 @@ def test_those_of_less_than_all_directions_are_refused(tmp_path: Path, monkeypat
         find_poses(tmp_path / "walk", SfmOptions(camera_model="EQUIRECTANGULAR"))
 
 
+@pytest.mark.slow
 def test_points_are_triangulated_from_panoramas_with_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])  # the middle column looks along -x

@@ -40,6 +40,7 @@ def capture(arc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_equal_photographs_have_equal_poses(copied: Copy) -> None:
     models = []
     for name in ("one", "two"):
@@ -48,6 +49,7 @@ def test_equal_photographs_have_equal_poses(copied: Copy) -> None:
     assert models[0] == models[1]
 
 
+@pytest.mark.slow
 def test_poses_are_found_once_however_the_path_is_written(
     copied: Copy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,6 +207,7 @@ def noise(rng: np.random.Generator, size: tuple[int, int] = (50, 40)) -> Image.I
     return Image.fromarray(rng.integers(0, 256, (*size[::-1], 3)).astype(np.uint8))
 
 
+@pytest.mark.slow
 def test_photographs_that_give_no_poses(arc: Path, tmp_path: Path) -> None:
     """Too few, unreadable, identical, unrelated or blank photographs."""
     rng = np.random.default_rng(0)
@@ -233,6 +236,7 @@ def test_photographs_that_give_no_poses(arc: Path, tmp_path: Path) -> None:
         find_poses(tmp_path / "none")
 
 
+@pytest.mark.slow
 def test_photographs_from_one_spot(tmp_path: Path, views: list[RoomView]) -> None:
     room = Room(0)
     for i, angle in enumerate(np.radians([-20, -12, -4, 4, 12, 20])):
@@ -316,6 +320,7 @@ def test_photographs_are_in_the_order_of_their_times() -> None:
     assert [each.name for each in ordered(same)] == ["x", "c", "b"], "as they are where all times are the same"
 
 
+@pytest.mark.slow
 def test_heic_photographs(tmp_path: Path, pictures: list[np.ndarray], views: list[RoomView]) -> None:
     """HEIC files as phones take them: rotated, with lens, time and gravity in EXIF."""
     folder = tmp_path / "phone"

@@ -53,6 +53,7 @@ def workers(folder: Path) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_a_killed_run_leaves_no_process_and_goes_on_where_it_stopped(copied: Copy) -> None:
     folder = copied("killed")
     run = started(folder)
@@ -71,6 +72,7 @@ def test_a_killed_run_leaves_no_process_and_goes_on_where_it_stopped(copied: Cop
     assert not list(folder.glob(".bitymi/*/.*.new"))
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_without_a_traceback(copied: Copy) -> None:
     folder = copied("interrupted")
     run = started(folder)
@@ -81,6 +83,7 @@ def test_ctrl_c_ends_it_without_a_traceback(copied: Copy) -> None:
     wait_for(lambda: not workers(folder))
 
 
+@pytest.mark.slow
 def test_a_full_disk_is_named(copied: Copy) -> None:
     folder = copied("full")
     limit = 300_000  # largest file size, as on a nearly full disk
@@ -95,6 +98,7 @@ def test_a_full_disk_is_named(copied: Copy) -> None:
     assert find_poses(folder).registered == 8
 
 
+@pytest.mark.slow
 def test_a_read_only_folder_is_no_hindrance(copied: Copy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = copied("read only")
     real = Path.mkdir
@@ -147,6 +151,7 @@ def test_a_model_that_cannot_be_written_has_its_reason(tmp_path: Path) -> None:
     assert lines[-1] == {"failure": f"{why}. Start again then: what is done is kept."}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", ["", "signal.signal(15, lambda *_: os._exit(3)); "])
 def test_signals_end_a_program_as_before_it_read_a_capture(before: str) -> None:
     program = f"import os, signal; {before}from bitymi_ns.capture import poses, read; os.kill(os.getpid(), 15)"

@@ -102,6 +102,7 @@ def test_a_mirrored_camera_leaves_the_world(photographs: list[Photograph]) -> No
     np.testing.assert_allclose(meant, right, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", [*INTRINSICS, SWAPPED])
 def test_intrinsics_of_other_pictures(kind: str, photographs: list[Photograph], reported: list[str]) -> None:
     camera = photographs[0].camera
@@ -112,6 +113,7 @@ def test_intrinsics_of_other_pictures(kind: str, photographs: list[Photograph], 
     assert f"the poses are read as {name}, which explains" in reported[-1]
 
 
+@pytest.mark.slow
 def test_none_fits(photographs: list[Photograph], reported: list[str]) -> None:
     """Poses of another path are kept, with a warning; a distortion that is wrong is left out."""
     given = [replace(each, pose=other.pose) for each, other in zip(photographs, photographs[::-1], strict=True)]

@@ -129,6 +129,7 @@ def test_all_frames_of_a_clip_of_a_second_are_looked_at(tmp_path: Path, wide: np
         extract_frames(tmp_path / "b.mp4", tmp_path / "b", None, silent)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [24, 30, 60])
 def test_of_a_longer_video_about_fifteen_frames_per_second_are_looked_at(
     tmp_path: Path, wide: np.ndarray, rate: int

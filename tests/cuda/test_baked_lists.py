@@ -13,6 +13,8 @@ from tests.bake.conftest import make_surfels
 from tests.cuda.baked_scenes import FLIP, camera_of, front, listed_pairs, most, scene_of
 from tests.ops.golden import crossing_scene, random_scene, reference, tiles_reached
 
+pytestmark = pytest.mark.slow
+
 
 def mask_pixels(renderer: BakedRenderer, surfels: int, width: int, height: int) -> int:
     """Count the pixels of all tile parts in a one-view frame's pairs, within the image or not."""

@@ -7,6 +7,8 @@ from bitymi_ns import ops
 from bitymi_ns.ops import trace_cuda
 from tests.scene import bands
 
+pytestmark = pytest.mark.slow
+
 
 def test_values_and_gradients_do_not_change(device: torch.device) -> None:
     whole, want = bands.step(device, 0)

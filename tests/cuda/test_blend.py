@@ -13,6 +13,8 @@ from tests.ops.golden import SceneCase, extreme_scenes, random_scene
 from tests.ops.test_blend import View
 from tests.ops.test_kernels import relative
 
+pytestmark = pytest.mark.slow
+
 Context = Callable[[], AbstractContextManager[None]]
 HERE = torch.device("cpu")
 

@@ -16,6 +16,8 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
 from tests.cuda.test_texel_training import HERE, START, config, scene_and_views
 
+pytestmark = pytest.mark.slow
+
 Context = Callable[[], AbstractContextManager[None]]
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 

@@ -6,6 +6,8 @@ import torch
 from tests.ops.golden import GOLDEN_NAMES, load_golden, random_scene, relative
 from tests.ops.test_pose_gradient import SMOOTH, differences, gradient, loss_of
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("name", [name for name in GOLDEN_NAMES if name != "textured"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])

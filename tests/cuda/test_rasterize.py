@@ -126,6 +126,7 @@ def test_the_golden_picture_and_gradients(device: torch.device) -> None:
     torch.testing.assert_close(texels.grad.cpu(), want, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [False, True], ids=["gradients", "descent"])
 @pytest.mark.parametrize("scene", extreme_scenes(), ids=lambda case: case.name)
 def test_extreme_scenes(scene: SceneCase, moved: bool, device: torch.device, cpu: Context) -> None:

@@ -290,6 +290,7 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
         ops.project(*(leaf.half() for leaf in leaves), camera)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("seed", range(2))
 def test_discs_across_the_camera_plane_are_listed_where_they_show(

@@ -14,6 +14,8 @@ from bitymi_ns.train.score import removal_errors
 from bitymi_ns.train.views import View
 from tests.ops.golden import random_scene
 
+pytestmark = pytest.mark.slow
+
 STEPS = 3
 
 

@@ -25,6 +25,8 @@ from bitymi_ns.train.step import view_losses
 from bitymi_ns.train.views import View
 from tests.ops.golden import SceneCase, random_scene
 
+pytestmark = pytest.mark.slow
+
 WIDTH, HEIGHT = 37, 21
 CORRECTIONS = {
     "none": None,

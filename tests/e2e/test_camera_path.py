@@ -13,6 +13,7 @@ from tests.view.browser import drive, served
 PSNR = 30.0
 
 
+@pytest.mark.slow
 def test_frames_of_a_recorded_path_are_the_pictures_of_the_page(
     bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

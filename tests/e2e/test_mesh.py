@@ -29,6 +29,7 @@ def place(bundle: Path, transform: np.ndarray) -> None:
     (bundle / "bundle.json").write_bytes(dump(info))
 
 
+@pytest.mark.slow
 def test_a_run_and_its_bundle_give_the_same_surface(trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path) -> None:
     run = mesh_of(trained.get_base_dir() / "config.yml", tmp_path / "run", frame="scene")
     baked = mesh_of(bundle / "config.yml", tmp_path / "bundle", frame="scene")
@@ -64,6 +65,7 @@ def test_a_mesh_of_a_crop_has_no_more(
         mesh_of(trained.get_base_dir() / "config.yml", tmp_path / "run", crop=True)
 
 
+@pytest.mark.slow
 def test_a_closed_mesh_is_closed(bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     mesh_of(bundle / "config.yml", tmp_path / "mesh", watertight=True, triangles=5000)
     shape = trimesh.load_mesh(tmp_path / "mesh" / "mesh.ply")
@@ -71,6 +73,7 @@ def test_a_closed_mesh_is_closed(bundle: Path, tmp_path: Path, capsys: pytest.Ca
     assert "not watertight" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_mesh_on_a_map_states_its_origin(
     copied: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -109,6 +112,7 @@ def test_a_capture_that_is_bent_names_the_scenes_frame(
         assert "bundle" not in str(raised.value) and not (tmp_path / "mesh").exists()
 
 
+@pytest.mark.slow
 def test_what_stands_in_the_place_of_a_mesh_is_kept(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
     config, folder = trained.get_base_dir() / "config.yml", tmp_path / "mesh"
     folder.mkdir()

@@ -131,6 +131,7 @@ def test_a_bundle_without_run_is_in_the_frame_of_its_captures_files(
     assert found["psnr"] == pytest.approx(log.entries[-1].psnr, abs=2.5)
 
 
+@pytest.mark.slow
 def test_a_run_whose_capture_was_moved(
     trained: BitymiTrainerConfig,
     room: Path,

@@ -30,6 +30,7 @@ def curve(config: BitymiTrainerConfig) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (config.get_base_dir() / FILE).read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_no_quality_is_reported_over_no_pixels(start: Start, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     add_masks(capture, lambda i: 0 if i in (0, 8) else 255)
     config = start(data=capture)
@@ -59,6 +60,7 @@ def test_a_view_that_sees_none_of_the_points(
     assert f"{room}/images/frame_00003.png sees none of the points that training starts from" in output
 
 
+@pytest.mark.slow
 def test_a_capture_of_several_cameras_trains_is_exported_and_evaluated(
     start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

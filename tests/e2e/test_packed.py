@@ -53,6 +53,7 @@ def test_the_folder_of_a_file_is_opened_by_nerfstudio(
     assert "room is there already: choose another folder (--output)" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_file_gives_the_mesh_of_its_folder(packed: Path, bundle: Path, tmp_path: Path) -> None:
     found = []
     for config, name in ((packed, "a"), (bundle / "config.yml", "b"), (bundle, "c")):
@@ -115,6 +116,7 @@ def denied(path: Path) -> bool:
     raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
 
+@pytest.mark.slow
 def test_the_command_ends_in_one_line(packed: Path) -> None:
     command = [*python_command("nerfstudio.scripts.eval", "entrypoint"), "--load-config", packed]
     done = subprocess.run([*command, "--output-path", "unused.json"], capture_output=True, text=True)

@@ -38,6 +38,7 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
     assert steps == [20, 40, 60]  # the first point is that of the interrupted run
 
 
+@pytest.mark.slow
 def test_a_finished_run_can_be_made_longer_or_an_interrupted_one_shorter(
     trained: BitymiTrainerConfig, start: Start
 ) -> None:

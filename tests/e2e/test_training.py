@@ -136,6 +136,7 @@ def test_points_that_are_nan_are_left_out_and_counted(
         ns_train.main(start(data=spoiled, name="nan"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("empty", [False, True])
 def test_a_capture_without_points_starts_at_random(
     spoiled: Path, start: Start, capsys: pytest.CaptureFixture[str], empty: bool

@@ -46,6 +46,7 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["file", "folder", "bundle"])
 def test_a_kill_at_any_step_leaves_the_old_or_the_new_and_nothing_else(kind: str, tmp_path: Path) -> None:
     script = Path(__file__).with_name("kill_everywhere.py")

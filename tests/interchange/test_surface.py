@@ -92,6 +92,7 @@ def test_open3d_is_silent_and_cameras_are_needed() -> None:
         extract_surface(plane(60), gray, [], 0.02)
 
 
+@pytest.mark.slow
 def test_large_views_are_drawn_no_finer_than_the_voxels_need() -> None:
     sizes = []
 
@@ -109,6 +110,7 @@ def test_large_views_are_drawn_no_finer_than_the_voxels_need() -> None:
     assert set(sizes) == {(640, 480)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("resolution", [32, 64])
 def test_the_budget_and_the_closed_surface_are_kept(resolution: int) -> None:
     few = extract_surface(plane(40), gray, CAMERAS, 0.02, SurfaceOptions(resolution=64, triangles=200))

@@ -81,6 +81,7 @@ def drawn(
     return {file: torch.stack([pixels(url) for url in urls]) for file, urls in zip(files, pictures, strict=True)}
 
 
+@pytest.mark.slow
 def test_playcanvas_draws_what_splat_draws(surfels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def moderate(count: int, kind: str) -> dict[str, Tensor]:
         """Make surfels that cover pixels, with few colours above 1, where the engine's eight bits end."""

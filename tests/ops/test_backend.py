@@ -46,6 +46,7 @@ def test_the_record_is_that_of_the_module() -> None:
     assert _cpu_features.FEATURES[backend.cpu_module()] == module.CPU_FEATURES
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not _cpu_features.FEATURES["_cpu"], reason="compiled for every CPU of its kind")
 def test_an_old_cpu_gets_a_message_and_nothing_is_loaded(tmp_path: Path) -> None:
     *had, lacked = _cpu_features.FEATURES["_cpu"].split()

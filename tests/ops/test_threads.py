@@ -59,6 +59,7 @@ def processor_time(**environment: str) -> tuple[float, float]:
     return before, after
 
 
+@pytest.mark.slow
 @spinning
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
 def test_the_import_starts_no_threads() -> None:
@@ -67,6 +68,7 @@ def test_the_import_starts_no_threads() -> None:
     assert ready > imported  # the first kernel does
 
 
+@pytest.mark.slow
 @spinning
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
 def test_a_process_of_one_thread_stays_one() -> None:
@@ -75,6 +77,7 @@ def test_a_process_of_one_thread_stays_one() -> None:
     assert ready == imported
 
 
+@pytest.mark.slow
 @spinning
 def test_threads_do_not_spin_once_the_kernels_are_ready() -> None:
     before, after = processor_time()
@@ -83,6 +86,7 @@ def test_threads_do_not_spin_once_the_kernels_are_ready() -> None:
     assert after < 0.5 * before
 
 
+@pytest.mark.slow
 @spinning
 def test_the_users_own_choice_stands() -> None:
     # other programs take processors from spinning threads and give them none: the largest values are the true ones
@@ -150,6 +154,7 @@ print(*(int(abs(each / want - 1) < 1e-5) for each in (got, *loaded)))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits its address space")
 @pytest.mark.skipif("BITYMI_SANITIZED" in os.environ, reason="the sanitizer ends the process")
 @pytest.mark.parametrize("threads", ["1", "2"])
@@ -157,6 +162,7 @@ def test_a_kernel_without_memory_raises_and_releases_its_threads(threads: str) -
     assert printed(FAILS, OMP_NUM_THREADS=threads) == [3, 1]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_forked_processes_draw_with_one_thread() -> None:
     assert printed(FORKED, OMP_NUM_THREADS="2") == [1, 1, 1]

@@ -37,6 +37,7 @@ print(20 * count / 2**20, refused - start, traced - start, megabytes("VmRSS") - 
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads /proc")
 @pytest.mark.skipif("BITYMI_SANITIZED" in os.environ, reason="the sanitizer keeps memory that was given back")
 def test_fragments_that_are_not_wanted_take_no_memory() -> None:

@@ -124,6 +124,7 @@ def test_sphere_mirrors() -> None:
     assert np.abs(seen(a, on_floor) - seen(b, on_floor)).max() < 0.01
 
 
+@pytest.mark.slow
 def test_same_seed_same_capture(tmp_path: Path) -> None:
     args = {"views": 3, "width": 64, "height": 48, "points": 50}
     folders = [generate(tmp_path / name, seed=seed, **args) for name, seed in (("a", 4), ("b", 4), ("c", 5))]
@@ -133,6 +134,7 @@ def test_same_seed_same_capture(tmp_path: Path) -> None:
     assert files[0] != files[2]
 
 
+@pytest.mark.slow
 def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
@@ -160,6 +162,7 @@ def test_bad_sizes(tmp_path: Path, bad: dict) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_interrupted_stops_soon_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(*args: object) -> None:
         raise OSError(28, "No space left on device")

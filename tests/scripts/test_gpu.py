@@ -4,12 +4,15 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from tests.cuda.conftest import why_not_emulated
 from tests.required import skip_without
 
 SCRIPT = Path(__file__).resolve().parents[2] / "benchmarks" / "times.py"
 
 
+@pytest.mark.slow
 def test_frames_without_a_card(tmp_path: Path) -> None:
     """A failing row is a line of the page and could go unnoticed."""
     if reason := why_not_emulated():

@@ -21,6 +21,7 @@ def python(code: str, *path: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", setup + code], capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_torchvision_imports_here() -> None:
     result = python(
         "import torchvision, torchvision.models, torchvision.transforms, torchvision.utils, torch\n"

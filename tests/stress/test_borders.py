@@ -17,6 +17,8 @@ from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera, HashField, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 def test_points_exactly_on_the_faces_of_hash_cells(dtype: torch.dtype, backend: Backend) -> None:

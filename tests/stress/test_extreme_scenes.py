@@ -11,6 +11,8 @@ from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from tests.stress.limits import Case, cases
 
+pytestmark = pytest.mark.slow
+
 CASES = cases()
 NAMES = [case.name for case in CASES]
 LONG = "thousands_on_one_pixel"

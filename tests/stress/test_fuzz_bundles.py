@@ -22,6 +22,8 @@ from bitymi_ns.scene import Camera
 from tests.bundle.damage import amend, signed
 from tests.bundle.made import make
 
+pytestmark = pytest.mark.slow
+
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 EXAMPLES = 60 * MORE
 FORMATS = ("bc7", "uint8", "fp16", "lean")

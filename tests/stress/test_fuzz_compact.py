@@ -23,6 +23,8 @@ from bitymi_ns.codec.streams import StreamError, compress
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.damage import signed
 
+pytestmark = pytest.mark.slow
+
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 EXAMPLES = 200 * MORE
 MEMORY = 48 << 20

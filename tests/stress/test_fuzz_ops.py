@@ -19,6 +19,8 @@ from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 
+pytestmark = pytest.mark.slow
+
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 REFUSED = (ValueError, TypeError, RuntimeError, IndexError)
 EXTREME = (0.0, -0.0, 1e-38, 1e-30, 1e-12, 1.0, -1.0, 1 / 255, 30.0, -87.0, 88.0, 1e4, -1e6, 1e10, 1e19, -3e38)

@@ -234,6 +234,7 @@ def test_between_photographs_log_gains_and_other_entries_are_interpolated(kind: 
 # in training
 
 
+@pytest.mark.slow
 def test_training_learns_the_exposures(make_scene, views, uneven) -> None:
     results, grey = {}, torch.full((1, 1, 3), 0.5)
     for kind in ("off", "gain", "affine"):
@@ -261,6 +262,7 @@ def test_the_far_side_of_an_object_through_a_long_lens_is_hidden(views, ball) ->
         assert float(found.log_gains.abs().max()) < 0.05
 
 
+@pytest.mark.slow
 def test_held_out_photographs_are_judged_with_the_exposure_of_their_neighbours(make_scene, views) -> None:
     """The first three photographs are bright, the last three dark."""
     logs = torch.tensor([0.3, 0.3, 0.3, -0.3, -0.3, -0.3])

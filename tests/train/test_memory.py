@@ -57,6 +57,7 @@ print(json.dumps(found | trainer.training.by_memory))
 """
 
 
+@pytest.mark.slow
 def test_a_run_ends_below_a_limit_between_its_first_step_and_its_peak() -> None:
     def run(limit: float) -> tuple[dict[str, float], str]:
         done = subprocess.run([sys.executable, "-c", RUN, str(limit)], capture_output=True, text=True, check=True)

@@ -121,6 +121,7 @@ def test_views_drawn_worse_than_before_take_the_run_back(begun, views):
     assert trainer.training.guard.rollbacks == 1
 
 
+@pytest.mark.slow
 def test_rates_return_to_normal_after_a_good_window_but_once(begun):
     trainer = begun(50)
     guard = trainer.training.guard

@@ -69,6 +69,7 @@ def test_short_runs_stay_inside_the_run_and_reset_as_they_densify(max_steps):
     assert max_steps < 100 or schedule.reset_steps <= schedule.densify_steps
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("max_steps, every", [(30_000, 10), (3000, 8), (1200, 3), (300, 1)])
 def test_field_learns_on_few_steps_after_freezing_and_on_more_in_short_runs(max_steps, every):
     schedule = Schedule(TrainConfig(), max_steps)

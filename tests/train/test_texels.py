@@ -208,6 +208,7 @@ def test_a_run_resumes_before_and_after_its_texels_came(textured, views) -> None
         assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length", [45, 97, 400])
 def test_a_run_of_another_length_goes_on_at_every_event(textured, views, length: int) -> None:
     """Events of 60 steps: densifications until 29, resets, texels from 36, final prunes until 54, poses until 54."""

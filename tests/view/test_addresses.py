@@ -14,6 +14,8 @@ import pytest
 from bitymi_ns.view import single_site, site_of, write_static
 from tests.view.browser import drive
 
+pytestmark = pytest.mark.slow
+
 TEXT = "document.getElementById('page').innerText"
 PLACE = "location.pathname + ' ' + document.documentElement.dataset.state + ' ' + document.title"
 

@@ -51,6 +51,7 @@ def page_of(site: Site, *before: list[object], path: str = "") -> tuple[str, str
     return state, text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "format, seen, share, alpha",
     [
@@ -73,6 +74,7 @@ def test_frames_are_those_of_the_cpu_renderer(
     assert mean < MEAN and largest < 12 / 255
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share, least", [(0.25, 47.0), (0.125, 45.7)])
 def test_far_views_are_averages_of_near_ones(share: float, least: float, tmp_path: Path) -> None:
     bundle = write(tmp_path / "b", "uint8", compact=True, seen=True, alpha=True, larger=0.7)
@@ -84,6 +86,7 @@ def test_far_views_are_averages_of_near_ones(share: float, least: float, tmp_pat
     assert psnr(got, averaged({"rgb": full}, round(1 / share))["rgb"][0].clamp(0, 1)) > least
 
 
+@pytest.mark.slow
 def test_of_far_scenes_the_part_with_the_scene_is_drawn(tmp_path: Path) -> None:
     bundle = write(tmp_path / "b", "uint8", compact=True, seen=True, alpha=True, larger=0.7)
     camera = front(WIDTH, HEIGHT, 48.0)  # a sixteenth of the size
@@ -100,6 +103,7 @@ def test_of_far_scenes_the_part_with_the_scene_is_drawn(tmp_path: Path) -> None:
     assert psnr(got, want) > 50.0 and float(want.max()) > 0.2
 
 
+@pytest.mark.slow
 def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
     """The server withholds them until that picture is saved; the bundle is one file."""
     bundle = write(tmp_path / "b", "uint8", compact=True, alpha=True)
@@ -125,6 +129,7 @@ def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
     assert difference(first, bundle)[0] > 4 * difference(first, plain)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["surfels.bin", "texels.bin"])
 def test_a_damaged_compact_bundle_gets_a_page_that_says_so(name: str, tmp_path: Path) -> None:
     """With a valid hash, as for deliberate damage."""
@@ -137,6 +142,7 @@ def test_a_damaged_compact_bundle_gets_a_page_that_says_so(name: str, tmp_path: 
     assert state == "error" and "damaged" in text and "a column is damaged" in text
 
 
+@pytest.mark.slow
 def test_a_shared_link_brings_the_same_picture(bundle: Path, tmp_path: Path) -> None:
     with served(site_of(bundle)) as address:
         first = drive(
@@ -160,6 +166,7 @@ def test_a_browser_without_webgpu_gets_a_page_that_says_so(bundle: Path) -> None
     assert "no WebGPU" in text and "Update the browser" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", [HIDE, NO_ADAPTER])
 @pytest.mark.parametrize("pictures", [{"preview.jpg": 64, "poster.webp": 32}, {"preview.jpg": 0, "poster.webp": 32}])
 def test_without_webgpu_the_preview_is_shown_or_else_the_poster(
@@ -237,6 +244,7 @@ ERRORS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ERRORS)
 def test_what_the_device_says_of_itself_has_a_page(what: str, bundle: Path) -> None:
     """The page stays whatever happens later; for a lost device also after the first picture."""

@@ -27,6 +27,7 @@ def clients(address: str, path: str, count: int) -> list[socket.socket]:
     return found
 
 
+@pytest.mark.slow
 def test_slow_clients_share_one_copy_of_a_file() -> None:
     made: list[int] = []
 

@@ -16,6 +16,8 @@ from bitymi_ns.bake import export
 from tests.view.conftest import baked_scene
 from tests.view.steps import MIDDLE, PHONE, START, Steps
 
+pytestmark = pytest.mark.slow
+
 
 def by(across: int, down: int) -> list[tuple[int, int]]:
     return [MIDDLE, (MIDDLE[0] + across, MIDDLE[1] + down)]

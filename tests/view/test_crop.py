@@ -18,6 +18,8 @@ from tests.view.steps import PHONE, START, Steps
 from tests.view.test_browser import MEAN, difference
 from tests.view.test_path import FITS
 
+pytestmark = pytest.mark.slow
+
 STATUS = "document.getElementById('status').textContent.split(' · ')[2]"
 LABELS = "[...document.querySelectorAll('.label')].filter((e) => !e.hidden).map((e) => e.textContent).join('|')"
 WIDE = {"from": -0.7, "to": 0.7}

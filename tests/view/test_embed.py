@@ -5,11 +5,14 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.view import single_site, write_static
 from tests.bundle.test_notes import text
 from tests.view.browser import drive, plain_server
+
+pytestmark = pytest.mark.slow
 
 HOST = """<!doctype html><link rel="icon" href="data:,"><iframe id="a" src="{a}"></iframe>
 <iframe id="b" src="{b}"></iframe>

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -15,6 +16,8 @@ from tests.bundle.damage import amend
 from tests.view.conftest import HEIGHT, WIDTH, write
 from tests.view.steps import Seen, Steps
 from tests.view.test_browser import MEAN
+
+pytestmark = pytest.mark.slow
 
 GAINS = [0.4, 1.0, 1.8]
 AFFINE = [*[0.7, 0.2, 0.0, 0.05], *[0.0, 0.8, 0.1, 0.0], *[0.1, 0.0, 0.6, 0.1]]

@@ -21,6 +21,8 @@ from tests.view.browser import drive, plain_server
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 from tests.view.test_browser import MEAN
 
+pytestmark = pytest.mark.slow
+
 LARGEST = 12 / 255
 ALL, COMPACT = {"format": "uint8", "tolerance": 0.0}, {"compact": True}
 CASES = {

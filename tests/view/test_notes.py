@@ -17,6 +17,8 @@ from tests.view.conftest import write
 from tests.view.steps import PHONE, START, Steps
 from tests.view.test_path import FITS, SECOND, there
 
+pytestmark = pytest.mark.slow
+
 VIEWS, REMARKS = (
     f"[...document.querySelectorAll('#{part} .name')].map((e) => e.value || e.textContent).join('|')"
     for part in ("view-rows", "note-rows")

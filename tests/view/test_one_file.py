@@ -13,6 +13,8 @@ from tests.view.browser import drive, plain_server
 from tests.view.conftest import HEIGHT, WIDTH, write
 from tests.view.test_browser import MEAN, STATE, difference
 
+pytestmark = pytest.mark.slow
+
 SCREEN = (WIDTH, HEIGHT)
 NAME = "scene.bitymi"
 

@@ -9,6 +9,8 @@ import pytest
 
 from tests.view.steps import MIDDLE, START, Steps
 
+pytestmark = pytest.mark.slow
+
 SECOND = START.replace("p=0,-3,0", "p=1,-3,0")
 ROWS = "[...document.querySelectorAll('#keyframes .name')].map((e) => e.textContent).join()"
 TOTAL = "document.getElementById('seconds').value"

@@ -19,6 +19,8 @@ from tests.view.browser import Outcome, drive, plain_server, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 from tests.view.test_browser import MEAN, difference
 
+pytestmark = pytest.mark.slow
+
 SCREEN = (WIDTH, HEIGHT)
 SHOWN = "!document.getElementById('poster').hidden"
 STATE = "document.documentElement.dataset.state"

@@ -321,6 +321,7 @@ def test_a_body_is_no_second_request(bundle: Path, method: str, header: str) -> 
     assert answer.count(b"HTTP/1.1 ") == 1 and b"HTTP/1.1 200" not in answer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("data", [b"", b"GET / HT", b"GET / HTTP/1.1\r\nHost: localhost\r\n", b"drip"])
 def test_half_a_request_is_not_waited_for(bundle: Path, data: bytes) -> None:
     begin = time.monotonic()

@@ -80,6 +80,7 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
     assert len(fakes.calls()) == 4 - at and len(lines(work)) == 4
 
 
+@pytest.mark.slow
 def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
     fakes, matrix: Matrix, capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

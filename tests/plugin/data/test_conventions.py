@@ -83,6 +83,7 @@ def of_scan(capture: Path, change: Change) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", [*JSON, model, *SCANS, stray_scanner])
 def test_right_ones_are_nothing_to_speak_of(
     capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
@@ -93,6 +94,7 @@ def test_right_ones_are_nothing_to_speak_of(
     assert decided() and "poses are read as" not in text and "badly" not in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "name"),
     [

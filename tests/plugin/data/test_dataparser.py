@@ -300,6 +300,7 @@ def test_it_is_what_the_presets_read_with() -> None:
     assert given == BitymiDataParserConfig(data=Path("x"), eval_names=("a b.jpg", "\u00e4.jpg"), downscale_factor=4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parser", ["bitymi-data", "nerfstudio-data", "blender-data"])
 def test_two_captures_are_refused(tmp_path: Path, parser: str) -> None:
     """nerfstudio silently reads the first."""

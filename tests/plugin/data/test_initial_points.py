@@ -45,6 +45,7 @@ def triangulating(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bitymi_ns.capture.known_poses.triangulate", TRIANGULATE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_points_are_triangulated_once(
     arc: Path, tmp_path: Path, triangulating: None, mirrored: bool, capsys: pytest.CaptureFixture[str]
@@ -64,6 +65,7 @@ def test_points_are_triangulated_once(
     assert list((capture / ".bitymi").glob("points-*/points"))
 
 
+@pytest.mark.slow
 def test_masked_pixels_give_no_points(arc: Path, tmp_path: Path, triangulating: None) -> None:
     capture = Path(shutil.copytree(arc, tmp_path / "arc"))
     mask = np.zeros((SIZE[1], SIZE[0]), np.uint8)

@@ -70,6 +70,7 @@ def test_a_small_capture_is_read_once(many: Path, alive: Any) -> None:
     assert look_at_all(load_any(many), pictures) == len(reads) == TRAIN + HELD_OUT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("distortion", [{}, {"k1": 0.05, "p1": 0.01}])
 def test_pixels_and_cameras_are_the_same(
     many: Path, distortion: dict[str, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

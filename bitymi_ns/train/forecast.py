@@ -47,7 +47,8 @@ def expected_surfels(schedule: Schedule, first: int, pixels: float, most: int = 
 
 class Forecast:
     """Time that a run will still take. A step costs in proportion to its pixels and surfels, and what it draws beside
-    its view adds to it; a unit of this cost takes as long as it took in the last steps.
+    its view adds to it; a unit of this cost takes as long as it took in the last steps, and longer at sizes of pictures
+    at which a measured step did (`compare_sizes`).
 
     Attributes:
         left: seconds to the end of the run; None before the first steps.
@@ -74,7 +75,7 @@ class Forecast:
             card: the run is on a card, where small pictures take as long as large ones.
         """
         steps = schedule.max_steps
-        size = np.array([1.0 if card else schedule.resolution_factor(step) ** 2 for step in range(steps)])
+        sizes = np.array([1.0 if card else schedule.resolution_factor(step) for step in range(steps)])
         of_step = np.where(np.arange(steps) >= schedule.texels_start, TEXELS, 1.0)
         at_full_size = np.zeros(steps)
         of_step[list(schedule.densify_steps)] += DRAWN * min(views, schedule.config.densify.views)
@@ -84,29 +85,71 @@ class Forecast:
             at_full_size[schedule.texels_start] += DRAWN * min(views, schedule.survey_views)
         for step, count in evaluated.items():
             at_full_size[step] += DRAWN * count
-        self._by_pixels = (of_step * size + at_full_size) * pixels
-        self._by_surfels = (of_step + at_full_size) * surfels * SURFEL
-        units = self._by_pixels + self._by_surfels
-        self._units, self._after = units, units[::-1].cumsum()[::-1] - units
-        self._begin, self._warm, self._seconds, self._done = 0.0, first + WARM, 0.0, 0.0
+        self._of_step, self._at_full_size = of_step, at_full_size
+        self._sizes, self._pixels, self._surfels = sizes, pixels, surfels
+        self._measured, self._times = np.zeros(1), np.ones(1)  # logarithm of a size, and how much longer a unit takes
+        self._begin, self._warm = (0.0, 0.0), first + WARM
+        self._seconds = self._cpu = self._steps = self._done = 0.0  # of the last steps: times, their number and units
+        self._plan()
         self.left: float | None = None
         self.settled = False
 
+    def _plan(self) -> None:
+        self._units = self._cost()
+        self._after = self._units[::-1].cumsum()[::-1] - self._units
+
+    def _cost(self, side: float = 1.0) -> Steps:
+        """Compute the cost of each step if the sides of all pictures were `side` times as long."""
+
+        def of_view(sizes: Steps | float) -> Steps:
+            longer = np.interp(np.log(side * sizes), self._measured, self._times)
+            return longer * ((side * sizes) ** 2 * self._pixels + SURFEL * self._surfels)
+
+        return self._of_step * of_view(self._sizes) + self._at_full_size * of_view(1.0)
+
+    def compare_sizes(self, step: int, seconds: Mapping[float, float]) -> None:
+        """Let steps at other sizes take as long as they were measured to take.
+
+        Memory of large fragment lists comes from the system in every step, and larger ones still are made in bands, so
+        that a fragment can take twice as long in large pictures; how much longer depends on the machine.
+
+        Args:
+            step: at which they were measured.
+            seconds: CPU seconds of a view in a step, by factor of the sides of pictures; of the size of this step, too.
+        """
+        sizes = np.array(sorted(seconds))
+        beside = max(0.0, self._cpu / self._steps - seconds[self._sizes[step]])  # of a step: for views of any size
+        units = sizes**2 * self._pixels + SURFEL * self._surfels[step]
+        times = np.array([seconds[size] + beside for size in sizes]) / units
+        self._measured, self._times = np.log(sizes), times / times[-1]
+        before = self._units[step]
+        self._plan()
+        self._done *= self._units[step] / before
+        self._estimate(step)
+
     def begin(self) -> None:
         """Note that a step begins."""
-        self._begin = time.perf_counter()
+        self._begin = time.perf_counter(), time.process_time()
 
     def end(self, step: int) -> None:
         """Note that a step has ended, with what belongs to it."""
         if step >= self._warm:
             fade = 1.0 - 1.0 / RECENT
-            self._seconds = fade * self._seconds + time.perf_counter() - self._begin
+            self._seconds = fade * self._seconds + time.perf_counter() - self._begin[0]
+            self._cpu = fade * self._cpu + time.process_time() - self._begin[1]
+            self._steps = fade * self._steps + 1.0
             self._done = fade * self._done + self._units[step]
-            self.left = float(self._seconds / self._done * self._after[step])
+            self._estimate(step)
             steps = step + 1 - self._warm
             self.settled = steps >= ENOUGH or (steps > 1 and self._seconds > PATIENCE)
 
+    def _estimate(self, step: int) -> None:
+        self.left = float(self._seconds / self._done * self._after[step])
+
     def half(self) -> float:
         """Compute the factor of the pictures' sides by which the whole run takes half as long; 0 if none does."""
-        pixels, surfels = self._by_pixels.sum(), self._by_surfels.sum()
-        return float(max(0.0, 0.5 - 0.5 * surfels / pixels) ** 0.5)
+        low, high, wanted = 0.0, 1.0, 0.5 * self._units.sum()
+        for _ in range(20):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if self._cost(middle).sum() <= wanted else (low, middle)
+        return low if low > 0.01 else 0.0  # surfels alone take more

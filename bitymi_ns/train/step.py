@@ -15,6 +15,7 @@ from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
 from bitymi_ns.ops.picture_cuda import PhotographTarget
+from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
@@ -29,12 +30,14 @@ from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.step_sizes import StepSizes
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.texels import LearningTexels
-from bitymi_ns.train.views import DownscaledViews, TrainingData, View, background_changes, step_background
+from bitymi_ns.train.views import DownscaledViews, TrainingData, View, at_size, background_changes, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.ops.project import Projection
     from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import RenderOutput, Scene
+
+TIMED_VIEWS = 2  # views that tell what a step takes at another size
 
 
 def view_losses(
@@ -205,6 +208,22 @@ class Training:
             self.guard.failed(self.step, diverged or TrainingDiverged(problem))
             self.step_sizes.measure(self.scene)
             self._set_rates()
+
+    def seconds_at(self, factor: float) -> float:
+        """Measure the mean CPU seconds of a few training views at another size, drawn, compared and differentiated. The
+        gradients are dropped: the run goes on as if nothing had been drawn. CPU time, as other programs may interrupt.
+        """
+        learned = [parameter for parameter in self.scene.parameters() if parameter.requires_grad]
+        seconds = []
+        for index in spread(len(self._full_size), TIMED_VIEWS + 1):
+            full = self._full_size[index]
+            view = at_size(full, full.camera.scaled(factor) if factor < 1.0 else full.camera, learned[0].device)
+            begin = time.process_time()
+            terms, _ = view_losses(self.scene, view, self.schedule, self.step, LossWatch(), self.background)
+            torch.autograd.grad(torch.stack(list(terms.values())).sum(), learned, allow_unused=True)
+            seconds.append(time.process_time() - begin)
+        seconds = seconds[1:] or seconds  # the first one also pays for memory that later ones of this size find
+        return sum(seconds) / len(seconds)
 
     def combine(self) -> dict[str, Tensor]:
         """Average the gradients over all views of the step; call it after the backward passes. Returns rate factors [N]

@@ -18,6 +18,7 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import callbacks
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig, method_config
 from bitymi_ns.train import forecast
+from bitymi_ns.train.step import Training
 
 
 def run_on(capture: Path, output: Path) -> BitymiTrainerConfig:
@@ -79,6 +80,7 @@ def test_a_long_run_says_at_the_start_when_it_will_end(
     monkeypatch.setattr(forecast, "ENOUGH", 1)
     monkeypatch.setattr(callbacks, "SOON", 0)
     monkeypatch.setattr(forecast, "SURFEL", 0.001)
+    monkeypatch.setattr(Training, "seconds_at", lambda self, factor: 1e6 * factor**2)
     ns_train.main(run_on(capture, tmp_path / "outputs"))
     printed = capsys.readouterr().out
     assert printed.count("The run will end in about ") == 1 and printed.index("will end") < printed.index("step ")

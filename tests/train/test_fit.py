@@ -83,6 +83,22 @@ def test_a_resumed_run_is_the_same_run(make_scene, views, options):
         torch.testing.assert_close(*moments)
 
 
+def test_timing_a_step_at_other_sizes_changes_nothing(make_scene, views):
+    plain, timed = (Trainer(make_scene(), views, TrainConfig(densify=EVERY_EVENT), 40) for _ in range(2))
+    for step in range(20):
+        plain.advance()
+        timed.advance()
+        if step in (2, 12):
+            assert all(timed.training.seconds_at(size) >= 0.0 for size in (0.25, 0.5, 1.0))
+    assert len(plain.scene) == len(timed.scene) and plain.scene.state_dict().keys() == timed.scene.state_dict().keys()
+    assert all(torch.equal(value, timed.scene.state_dict()[name]) for name, value in plain.scene.state_dict().items())
+    moments = [
+        [torch.get_rng_state(), *trainer.optimizers["means"].state_dict()["state"][0].values()]
+        for trainer in (plain, timed)
+    ]
+    assert all(torch.equal(a, b) for a, b in zip(*moments, strict=True))
+
+
 def test_the_field_learns_on_its_steps_only(make_scene, views):
     scene, config = make_scene(), TrainConfig(resolution_schedule=0, freeze_min_updates=50)
     schedule = Schedule(config, 600)

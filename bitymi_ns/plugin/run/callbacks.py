@@ -19,6 +19,7 @@ from torch.nn import Parameter
 
 from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.files import reason, write_errors_as, write_file
+from bitymi_ns.ops.backend import give_back_memory
 from bitymi_ns.plugin.console import InputError, duration, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
@@ -109,13 +110,24 @@ class TrainingRun:
         card, mean = self.scene.surfels["means"].is_cuda, sum(pixels) / len(pixels)
         return Forecast(self.training.schedule, len(pixels), mean, surfels, evaluated, self.first_step, card)
 
-    def _say_end(self) -> None:
+    def _compare_sizes(self, step: int) -> None:
+        """Measure for the forecast what a step takes at the sizes of pictures that are to come."""
+        schedule = self.training.schedule
+        sizes = {schedule.resolution_factor(later) for later in range(step, self.total)}
+        if len(sizes) < 2 or self.scene.surfels["means"].is_cuda:
+            return
+        with suppress(TrainingDiverged, MemoryError):  # those end a run only where its own steps raise them
+            self.forecast.compare_sizes(step, {size: self.training.seconds_at(size) for size in sorted(sizes)})
+        give_back_memory()
+
+    def _say_end(self, step: int) -> None:
         """Say once, after the first steps, when the run will end, and what would halve its time."""
-        left = self.forecast.left
-        if left is None or self._end_said or not self.forecast.settled:
+        if self._end_said or not self.forecast.settled:
             return
         self._end_said = True
-        if left < SOON:
+        self._compare_sizes(step)
+        left = self.forecast.left
+        if left is None or left < SOON:
             return
         when = time.strftime("%H:%M" if left < 20 * 3600 else "%Y-%m-%d %H:%M", time.localtime(time.time() + left))
         side = 0 if self.scene.surfels["means"].is_cuda else 10 * int(self.forecast.half() * self._longest_side / 10)
@@ -185,7 +197,7 @@ class TrainingRun:
         if step in self.curve_steps:
             self._add_point(step)
         self.forecast.end(step)
-        self._say_end()
+        self._say_end(step)
 
     def _diverged(self, error: TrainingDiverged) -> NoReturn:
         fail(

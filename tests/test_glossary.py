@@ -6,7 +6,6 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 NUMBERED = 10
 """Numbered equations of the paper."""
-REFERENCE = "bitymi_ns/ops/reference"
 CODE = r"`(\w+)`"
 
 
@@ -37,28 +36,3 @@ def test_names_are_defined_where_the_page_says() -> None:
     for _, _, file, name in rows("Equations"):
         assert re.fullmatch(CODE, name), name
         assert defines(file, (ROOT / file).read_text("utf8"), name.strip("`")), f"{file} does not define {name}"
-
-
-def test_every_formula_has_its_file_and_its_twin() -> None:
-    table = rows("Where a formula lives")
-    assert len(table) > 20
-    for formula, files, twin in table:
-        mentioned = re.findall(r"[\w/]+\.(?:h|cpp|cu|py)\b", files)
-        assert mentioned, f"{formula} has no file"
-        for file in [*mentioned, *re.findall(r"bitymi_ns/[\w/]+\.py", formula)]:
-            assert (ROOT / file).is_file(), f"{formula}: there is no {file}"
-        for name in re.findall(CODE, files):
-            texts = [(ROOT / file).read_text("utf8") for file in mentioned]
-            assert any(re.search(rf"^ *def {name}\(", text, re.MULTILINE) for text in texts), f"{formula}: no {name}"
-        twins = re.findall(r"[\w/]+\.py\b", twin)
-        assert twins or not twin or twin.startswith("none: "), f"{formula}: {twin}"
-        for file in twins:
-            assert any((ROOT / folder / file).is_file() for folder in (REFERENCE, "")), f"{formula}: there is no {file}"
-
-
-def test_symbols_are_names_of_the_code() -> None:
-    sources = [*ROOT.glob("bitymi_ns/**/*.py"), *ROOT.glob("csrc/**/*.h")]
-    words = set(re.findall(r"\w+", "\n".join(path.read_text("utf8") for path in sources)))
-    for symbol, names, _ in rows("Symbols"):
-        for name in re.findall(CODE, names):
-            assert name in words, f"{symbol}: the code has no {name}"

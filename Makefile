@@ -112,7 +112,8 @@ web/node_modules/.package-lock.json: web/package-lock.json
 	cd web && npm ci --loglevel=error --no-fund --no-audit
 	@touch $@
 
-web: web/node_modules/.package-lock.json
+web: setup web/node_modules/.package-lock.json
+	$(BIN)/python -m scripts.page_tables
 	cd web && npm run --silent build
 
 web-test:

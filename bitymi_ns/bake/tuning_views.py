@@ -20,7 +20,7 @@ from bitymi_ns.ops import (
     select,
     view_color,
 )
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import count_values, photometric

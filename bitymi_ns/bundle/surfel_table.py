@@ -22,7 +22,7 @@ from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.codec.limits import ALPHA_LIMIT, EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0, SUPPORT
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
 from bitymi_ns.ops.view_color import LEAN, check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere, kind_of
 from bitymi_ns.scene.baked import BakedScene
@@ -36,11 +36,7 @@ TERMS = "view_term"
 
 # Columns of the parameters that are not named `<parameter>_<i>`.
 COLUMNS: dict[str, tuple[str, ...]] = {
-    "means": ("x", "y", "z"),
-    "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
-    "log_scales": ("scale_0", "scale_1"),
-    "opacity_logits": ("opacity",),
-    "beta_raw": ("beta",),
+    **{name: parameter.columns for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.columns},
     "mean_residual": ("residual_0", "residual_1", "residual_2"),
     "view_terms": tuple(f"term_{i}" for i in range(max(kind.lean_width for kind in VIEW_COLORS.values()))),
 }
@@ -80,8 +76,9 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
         ("opacity",): surfels["opacity_logits"][:, None],
         _numbered("scale", 3): torch.cat([surfels["log_scales"], flat], dim=1),
         COLUMNS["quats"]: quats,
-        ("beta",): surfels["beta_raw"][:, None],
     }
+    for name in GEOMETRY_PARAMETERS.keys() - {"means", "opacity_logits", "log_scales", "quats"}:
+        groups[COLUMNS[name]] = surfels[name].reshape(len(quats), -1)
     for name in ("view_base",) if lean else VIEW_COLORS[kind].names:
         values = surfels[name].reshape(len(quats), int(np.prod(surfels[name].shape[1:])))
         groups[_numbered(name, values.shape[1])] = values
@@ -167,9 +164,11 @@ def from_columns(
     if kind not in VIEW_COLORS:
         raise PlyError(f"the view colour {kind!r} is none of {sorted(VIEW_COLORS)}")
     tiles = _stack(columns, TILE_COLUMNS, np.int32)
-    surfels = {name: _stack(columns, COLUMNS[name]) for name in GEOMETRY}
-    surfels |= {name: surfels[name][:, 0].contiguous() for name in ("opacity_logits", "beta_raw")}
-    count = len(surfels["means"])
+    count = len(tiles)
+    surfels = {
+        name: _stack(columns, COLUMNS[name]).reshape(count, *parameter.shape)
+        for name, parameter in GEOMETRY_PARAMETERS.items()
+    }
     if terms is not None:
         surfels |= _lean_from_columns(columns, terms, kind)
     else:

@@ -9,7 +9,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.view_kinds import COLOR_LIMIT, SHAPE_LIMIT, VIEW_COLORS, VIEW_PARAMETERS, Limit
+from bitymi_ns.ops.parameters import Limit
+from bitymi_ns.ops.view_kinds import COLOR_LIMIT, PARAMETERS, VIEW_COLORS
 
 RESIDUAL_LIMIT = 256.0  # largest absolute value of a residual colour
 ALPHA_ONE = 128  # byte of an alpha of 1
@@ -20,11 +21,7 @@ EXTENTS = (1e-6, 16.0)  # half sides of tiles in scale units
 UNIT_SLACK = 0.01  # tolerance of the length of a stored rotation
 
 LIMITS: dict[str, Limit] = {
-    "means": (1e9,),
-    "log_scales": (104.0,),  # beyond, exp() is 0 or infinite in float32
-    "opacity_logits": (SHAPE_LIMIT,),
-    "beta_raw": (SHAPE_LIMIT,),
-    **{name: parameter.limit for name, parameter in VIEW_PARAMETERS.items()},
+    **{name: parameter.limit for name, parameter in PARAMETERS.items()},
     "view_base": (COLOR_LIMIT,),
     "mean_residual": (RESIDUAL_LIMIT,),
 }

@@ -11,6 +11,7 @@ from torch import Tensor
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.limits import EXTENTS, LIMITS, limit_of
 from bitymi_ns.ops.constants import ALPHA_MIN
+from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
 from bitymi_ns.ops.view_color import LEAN
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
 
@@ -31,7 +32,7 @@ REFERENCE: dict[str, float] = {
 }
 """Reference steps of the columns whose precision is chosen; near them an error is about proportional to its step.
 Units: place (positions) as in `PositionGrid`, opacity and beta shares of their ranges, term_shape asinh."""
-PARAMETERS = {"place": "means", "rotation": "quats", "opacity": "opacity_logits", "beta": "beta_raw"}
+PARAMETERS = {parameter.code: name for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.code}
 """Surfel parameter of each column whose name differs."""
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
 from bitymi_ns.ops import TexelAlpha, fitting_lists, project
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera

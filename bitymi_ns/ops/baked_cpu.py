@@ -9,7 +9,8 @@ from torch import Tensor
 from .backend import kernel, lookup
 from .baked_scene import BakedSceneLike, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
-from .project import GEOMETRY, CameraLike, project
+from .parameters import GEOMETRY
+from .project import CameraLike, project
 from .trace_cpu import tile_lists
 from .view_color import view_color
 

@@ -14,7 +14,8 @@ from torch import Tensor
 from .backend import function, lookup, module, on_device
 from .baked_scene import IMAGES, LEVELS, BakedSceneLike, check_images, common_size, decode_bc7, residual
 from .constants import TILE
-from .project import GEOMETRY, CameraLike
+from .parameters import GEOMETRY
+from .project import CameraLike
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
+from .parameters import GEOMETRY, GEOMETRY_PARAMETERS
 from .texel import TexelAlpha
 
 
@@ -98,10 +100,6 @@ class Projection:
         return self.radii[:, 0] > 0
 
 
-GEOMETRY = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
-"""Names of the surfels' geometry parameters."""
-
-
 class _Project(torch.autograd.Function):
     @staticmethod
     def forward(ctx, camera, near, photo_pixel, viewmat, *geometry):
@@ -179,18 +177,13 @@ def refuse_skew(camera: CameraLike) -> None:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
 
 
-def checked_geometry(
-    means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, beta_raw: Tensor, camera: CameraLike
-) -> tuple[Tensor, ...]:
-    """Check the arguments of `project`; returns the surfels' in order. Raises ValueError: shapes or devices do not
-    match, or the camera has skew."""
-    n = means.shape[0]
-    shapes = {"means": (means, (n, 3)), "quats": (quats, (n, 4)), "log_scales": (log_scales, (n, 2))}
-    shapes |= {"opacity_logits": (opacity_logits, (n,)), "beta_raw": (beta_raw, (n,))}
-    check_shapes(**shapes)
-    on_same_device(means, **{name: tensor for name, (tensor, _) in shapes.items()})
+def checked_geometry(geometry: Sequence[Tensor], camera: CameraLike) -> Sequence[Tensor]:
+    """Check and return `GEOMETRY`. Raises ValueError: shapes or devices do not match, or the camera has skew."""
+    named, n = dict(zip(GEOMETRY, geometry, strict=True)), len(geometry[0])
+    check_shapes(**{name: (value, (n, *GEOMETRY_PARAMETERS[name].shape)) for name, value in named.items()})
+    on_same_device(geometry[0], **named)
     refuse_skew(camera)
-    return means, quats, log_scales, opacity_logits, beta_raw
+    return geometry
 
 
 def project(
@@ -225,6 +218,6 @@ def project(
     """
     if photo_pixel != 1.0 and (cuda_backend(means.device) or (torch.is_grad_enabled() and means.requires_grad)):
         raise ValueError("surfels are resized on the CPU and without gradients alone")
-    geometry = checked_geometry(means, quats, log_scales, opacity_logits, beta_raw, camera)
+    geometry = checked_geometry((means, quats, log_scales, opacity_logits, beta_raw), camera)
     geom, frames, radii, broken = _Project.apply(camera, near, photo_pixel, camera.viewmat, *geometry)
     return Projection(geom, frames, radii, camera, near, broken, photo_pixel, alpha=alpha)

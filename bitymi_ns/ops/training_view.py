@@ -14,8 +14,9 @@ from .backend import dense, kernel, kernel_class, module, on_device, stream_of, 
 from .bin_cuda import check_pair_count
 from .blend import checked_texels
 from .constants import FRAME, GEOM
+from .parameters import GEOMETRY
 from .picture_cuda import PhotographTarget
-from .project import GEOMETRY, CameraLike, Projection, checked_geometry, rigid_gradient
+from .project import CameraLike, Projection, checked_geometry, rigid_gradient
 from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
 from .view_color import check_view_color, lettered
 from .view_kinds import entry_of
@@ -173,7 +174,7 @@ def training_view(
         RuntimeError: 2^31 pairs of surfel and tile or more, or not a CUDA device.
         ValueError: as `project`, `view_color`, `picture_losses` and `blended_image`.
     """
-    geometry = checked_geometry(*(surfels[name] for name in GEOMETRY), camera)
+    geometry = checked_geometry([surfels[name] for name in GEOMETRY], camera)
     means = geometry[0]
     check_view_color(kind, surfels, len(means))
     photograph.check(means, (camera.height, camera.width))

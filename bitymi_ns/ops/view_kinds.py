@@ -12,30 +12,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from .constants import LOG_TAU_MAX, MAX_TERMS, SH_C0
+from .parameters import GEOMETRY_PARAMETERS, SHAPE_LIMIT, Limit, Parameter
 
-Limit = tuple[float, ...]
-"""Largest absolute value of a parameter: one number, or one for each entry of its last axis."""
 COLOR_LIMIT = 256.0  # of colours and of coefficients and lobes' colours, 1 = white
-SHAPE_LIMIT = 1e4  # of logits, angles and log sharpnesses: sigmoid and exp saturate far below
 DIRECTION_LIMIT = 1e6  # of unnormalised directions
 VECTOR_LIMIT = 2e7  # of differences of two unit vectors, each times a temperature of at most exp(16)
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A view-colour parameter with one row per surfel."""
-
-    name: str  # as in checkpoints, optimiser groups and columns of surfels.ply
-    shape: tuple[int, ...]  # of a row; -1 = number of terms, less the one that the first parameter may hold
-    limit: Limit  # allowed in a bundle
-    rate: Literal["view_color", "view_shape"]  # learning rate in `train.config.LearningRates`,
-    share: float = 1.0  # and its factor
-    activation: str | None = None  # activation as stated in bundle.json; None: not stated
-
-    @property
-    def width(self) -> int:
-        """Numbers per row, or per term of it."""
-        return math.prod(size for size in self.shape if size > 0)
 
 
 @dataclass(frozen=True)
@@ -237,8 +218,11 @@ VIEW_COLORS: dict[str, ViewColor] = {
     "sg": _with_lobes("Spherical Gaussian", "sg", _GAUSSIAN_LOBE, _sg_start, _sg_mean),
 }
 """Kinds by name."""
-VIEW_PARAMETERS: dict[str, Parameter] = {p.name: p for kind in VIEW_COLORS.values() for p in kind.parameters}
-"""Parameters of all kinds by name."""
+PARAMETERS: dict[str, Parameter] = {
+    **GEOMETRY_PARAMETERS,
+    **{p.name: p for kind in VIEW_COLORS.values() for p in kind.parameters},
+}
+"""All parameters of a surfel, with the view colours of all kinds, by name."""
 Kind = Literal[tuple(VIEW_COLORS)]  # type: ignore[valid-type]
 """Names of `VIEW_COLORS`, for options and files checked by type."""
 

@@ -26,8 +26,8 @@ from bitymi_ns.ops import (
     view_color,
 )
 from bitymi_ns.ops.constants import IMAGE_CHANNELS
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.picture_cuda import PhotographTarget
-from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.training_view import ComparedView, training_view
 
 from .camera import Camera

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import TexelAlpha, project, surfel_coverage
 from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
@@ -70,11 +71,11 @@ def visibility(
         alpha: opacities of the surfels' texels; None: opaque texels.
     """
     means = surfels["means"]
-    geometry = [surfels[name] for name in ("quats", "log_scales", "opacity_logits", "beta_raw")]
+    geometry = [surfels[name] for name in GEOMETRY]
     largest, pixels = means.new_zeros(2, len(means))
     squares = torch.zeros(len(cameras), len(means), dtype=torch.bfloat16, device=means.device)
     for done, camera in enumerate(cameras, start=1):
-        projection = project(means, *geometry, camera.to(means.device), near, alpha=alpha)
+        projection = project(*geometry, camera.to(means.device), near, alpha=alpha)
         shown = surfel_coverage(projection, weight_bound)
         largest, pixels = torch.maximum(largest, shown[:, 0]), torch.maximum(pixels, shown[:, 1])
         squares[done - 1] = shown[:, 2]

@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 from functools import cached_property
 
-from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
+from bitymi_ns.ops.view_kinds import PARAMETERS
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
@@ -231,12 +231,10 @@ class Schedule:
             return self._last_part.lr(name, 0) * self._falling(step)
         warmup = min(1.0, (step + 1) / max(1, self.scaled(self.config.field_warmup)))
         factor = warmup if name.startswith("field") else gain
-        if name == "means" and self.in_pixels:
-            name = "mean_pixels"
-        elif name == "means":
+        if name == "means" and not self.in_pixels:
             factor *= self.extent
-        if name in VIEW_PARAMETERS:
-            factor, name = factor * VIEW_PARAMETERS[name].share, VIEW_PARAMETERS[name].rate
+        elif name in PARAMETERS:
+            factor, name = factor * PARAMETERS[name].share, PARAMETERS[name].rate
         rate = getattr(rates, name)
         if not isinstance(rate, tuple):
             return factor * float(rate)

@@ -15,7 +15,7 @@ from torch.utils.hooks import RemovableHandle
 from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.ops import TexelDescent, add_texel_coverage, project
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField

@@ -7,7 +7,7 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.codec.pages import texel_alpha
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from tests.bake.conftest import make_camera, make_surfels

@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import baked_cuda
 from bitymi_ns.ops.baked_cuda import Stage, Workspace, slots_per_tile
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels

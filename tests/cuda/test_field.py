@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene import Camera, HashField
 from tests.ops.golden import random_scene
 from tests.ops.test_kernels import make_field, relative

@@ -12,7 +12,7 @@ import bitymi_ns
 from bitymi_ns import ops
 from bitymi_ns.ops import Marks, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from tests.ops.golden import SceneCase, camera_of, extreme_scenes, load_golden, random_scene
 from tests.ops.test_kernels import relative
 from tests.scene.test_texel_field import make

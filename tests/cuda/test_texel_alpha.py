@@ -10,7 +10,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from tests.cuda.test_trace import by_pixel_and_surfel
 from tests.ops.golden import SceneCase, camera_of, random_scene, relative
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import bin_cuda, capacity, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, workspace
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera

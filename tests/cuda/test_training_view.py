@@ -10,8 +10,8 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from bitymi_ns import ops
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.picture_cuda import PhotographTarget
-from bitymi_ns.ops.project import GEOMETRY
 from bitymi_ns.ops.texel import TexelDescent
 from bitymi_ns.ops.training_view import ComparedView, training_view
 from bitymi_ns.ops.view_kinds import VIEW_COLORS

@@ -11,7 +11,7 @@ import trimesh
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface, median_depth
 from bitymi_ns.ops import TexelAlpha, TexelTiles
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 from tests.ops.golden import GOLDEN_NAMES, camera_of, load_golden, reference

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import SV_KEYS, SceneCase, extreme_scenes, quaternions, random_scene
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.ops.reference.render import texel

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from tests.ops.golden import SceneCase, camera_of, composite_colors, load_golden, random_scene, reference_colors
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]

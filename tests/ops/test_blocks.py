@@ -8,7 +8,7 @@ from bitymi_ns.ops import trace_cpu
 from bitymi_ns.ops.backend import function, kernel_class, module
 from bitymi_ns.ops.constants import TILE
 from bitymi_ns.ops.fragment_list import empty_ids, empty_list
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from tests.ops.golden import camera_of, random_scene
 
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from bitymi_ns.measure.stability.scenes import quaternions
 from bitymi_ns.ops import backend
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from tests.ops.golden import crossing_scene, dense, far_floor, random_scene, reference, tiles_reached, traced
 
 

@@ -5,7 +5,7 @@ import torch
 
 from bitymi_ns.ops import baked, trace_cpu, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda, kernel, module
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from tests.cuda.conftest import why_not_emulated

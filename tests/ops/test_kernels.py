@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference.project import project
 from bitymi_ns.ops.reference.render import Render, render
 from bitymi_ns.ops.reference.view_color import sv, view_directions

@@ -12,7 +12,7 @@ from bitymi_ns.measure.stability.scenes import SceneCase, random_scene
 from bitymi_ns.ops import baked_cpu
 from bitymi_ns.ops.baked_scene import halved, tile_levels
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.scene.baked import BakedScene

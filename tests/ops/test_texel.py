@@ -12,7 +12,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.ops.golden import SceneCase, random_scene, reference_colors

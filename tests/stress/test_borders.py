@@ -9,7 +9,7 @@ import torch
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.errors import Backend
 from bitymi_ns.measure.stability.scenes import SV_KEYS, front_scene
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import field as reference_field
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color

@@ -7,7 +7,7 @@ from bitymi_ns import ops
 from bitymi_ns.measure.stability.errors import Backend, against_extended, measure
 from bitymi_ns.measure.stability.page import ACCURATE, ALLOWANCE
 from bitymi_ns.measure.stability.scenes import PLAIN, SWEEPS, WAYS, SceneCase, Sweep, random_scene
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene import Camera, HashField, Scene, SceneConfig
 from tests.stress.limits import Case, cases
 

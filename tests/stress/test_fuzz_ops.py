@@ -15,7 +15,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import SV_KEYS, random_scene
 from bitymi_ns.ops.field import FieldGeometry
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 

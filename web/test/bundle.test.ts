@@ -2,7 +2,8 @@ import { describe, expect, it } from 'vitest';
 import { parseKtx2 } from '../src/bundle/ktx2';
 import { parseManifest } from '../src/bundle/manifest';
 import { readCompactSurfels } from '../src/bundle/compact/surfels';
-import { SURFEL_WORDS, WORD, alphaIn, layerIn, readSurfels } from '../src/bundle/surfels';
+import { alphaIn, layerIn, readSurfels } from '../src/bundle/surfels';
+import { SURFEL_WORDS, WORD } from '../src/bundle/tables';
 import { DamagedBundle, ViewerError } from '../src/errors';
 import { EARLIER, bytes, floats } from './compact_bundles';
 

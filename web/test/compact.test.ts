@@ -3,7 +3,8 @@ import { pack } from '../src/bundle/compact/packing';
 import { readCompactSurfels } from '../src/bundle/compact/surfels';
 import { readCompactTexels } from '../src/bundle/compact/texels';
 import { parseManifest } from '../src/bundle/manifest';
-import { KINDS, LEAN_WIDTH, SURFEL_WORDS, WORD, alphaIn, layerIn } from '../src/bundle/surfels';
+import { alphaIn, layerIn } from '../src/bundle/surfels';
+import { KINDS, LEAN_WIDTH, SURFEL_WORDS, WORD } from '../src/bundle/tables';
 import { DamagedBundle } from '../src/errors';
 import { BUNDLES, EARLIER, type Written, bytes, floats, ints } from './compact_bundles';
 
@@ -35,8 +36,8 @@ describe.each(WRITTEN)('the compact bundle %s of version %s', (_, version, { fil
     compare('means', WORD.mean, 3, surfels.origin);
     compare('quats', WORD.quat, 4);
     compare('log_scales', WORD.logScale, 2);
-    compare('opacity_logits', WORD.opacity, 1);
-    compare('beta_raw', WORD.beta, 1);
+    compare('opacity_logits', WORD.opacityLogit, 1);
+    compare('beta_raw', WORD.betaRaw, 1);
     compare('view_base', WORD.base, 3);
     compare('mean_residual', WORD.residual, 3);
     compare('extent', WORD.extent, 1);

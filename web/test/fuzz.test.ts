@@ -4,7 +4,8 @@ import { expect, it } from 'vitest';
 import { readCompactSurfels } from '../src/bundle/compact/surfels';
 import { readCompactTexels } from '../src/bundle/compact/texels';
 import { parseManifest } from '../src/bundle/manifest';
-import { SURFEL_WORDS, WORD, layerIn } from '../src/bundle/surfels';
+import { layerIn } from '../src/bundle/surfels';
+import { SURFEL_WORDS, WORD } from '../src/bundle/tables';
 import { DamagedBundle } from '../src/errors';
 import { BUNDLES, bytes } from './compact_bundles';
 
@@ -13,10 +14,10 @@ const MOST_TIME = 2000; // milliseconds per bundle
 const LIMITS: [number, number, number][] = [
   // first word, words, largest size
   [WORD.mean, 3, 2.1e9],
-  [WORD.opacity, 1, 1e4],
+  [WORD.opacityLogit, 1, 1e4],
   [WORD.quat, 4, 1.0001],
   [WORD.logScale, 2, 104],
-  [WORD.beta, 1, 1e4],
+  [WORD.betaRaw, 1, 1e4],
   [WORD.extent, 1, 16],
   [WORD.residual, 3, 256],
   [WORD.base, 3, 256],

@@ -1,7 +1,7 @@
 import { readFileSync } from 'node:fs';
 import { describe, expect, it } from 'vitest';
 import type { Vec3 } from '../src/bundle/manifest';
-import { SURFEL_WORDS } from '../src/bundle/surfels';
+import { SURFEL_WORDS } from '../src/bundle/tables';
 import { keeper, keptOf } from '../src/view/crop';
 import { cleared, noNotes, notesText, parseNotes } from '../src/view/notes';
 

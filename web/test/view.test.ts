@@ -7,7 +7,7 @@ import { fromHash, toHash } from '../src/view/share';
 import { firstPose } from '../src/view/start';
 import { partOf, samplingOf, sizeOf } from '../src/view/size';
 import { dot, length, subtract } from '../src/view/vector';
-import { SURFEL_WORDS, WORD } from '../src/bundle/surfels';
+import { SURFEL_WORDS, WORD } from '../src/bundle/tables';
 
 const UP: Vec3 = [0, 0, 1];
 const pose = lookAt([4, 0, 1], [0, 0, 0], UP);

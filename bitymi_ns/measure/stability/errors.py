@@ -24,7 +24,7 @@ from bitymi_ns.measure.stability.scenes import (
     tiles_of,
 )
 from bitymi_ns.ops.backend import emulated_cuda, module
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import extended
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color

@@ -15,7 +15,7 @@ from torch.nn import Parameter
 from torch.optim import Optimizer
 
 from bitymi_ns.ops.constants import FEATURES, WIDTH
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.ranges import MOST
 from bitymi_ns.scene.config import SceneConfig
@@ -28,7 +28,6 @@ SURFELS = f"{SCENE}surfels."
 LARGEST = 1e15  # absolute value of a drawable parameter: its square, and sums of squares, are finite in float32
 _FIELD_GROUPS = {"field_table": ("field.field_table",), "field_mlp": tuple(f"field.field_w{i}" for i in (1, 2, 3))}
 """Parameters of the optimisers that are not of one surfel parameter, whose name they have."""
-_GEOMETRY = dict(zip(GEOMETRY, ((3,), (4,), (2,), (), ()), strict=True))
 
 
 class Misfit(ValueError):
@@ -131,7 +130,7 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
         for name, values in check_entries(state, scene).items()
     }
     broken = [name for name, rows in drawable.items() if not bool(rows.all())]
-    if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in _GEOMETRY]).all(0).any()):
+    if not bool(torch.stack([drawable[f"scene.surfels.{name}"] for name in GEOMETRY_PARAMETERS]).all(0).any()):
         raise Misfit(f"{broken[0]} holds numbers that are too large, or none, for every surfel")
     return broken
 
@@ -173,9 +172,8 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
         raise Misfit("it holds no surfels")
     kind = VIEW_COLORS[scene.view_color]
     view = zip(kind.names, kind.shapes(kind.terms_of(getattr(scene, kind.option))), strict=True)
-    found = {
-        f"{SURFELS}{name}": pipeline[f"{SURFELS}{name}"].tensor(n, *row) for name, row in (*_GEOMETRY.items(), *view)
-    }
+    geometry = ((name, parameter.shape) for name, parameter in GEOMETRY_PARAMETERS.items())
+    found = {f"{SURFELS}{name}": pipeline[f"{SURFELS}{name}"].tensor(n, *row) for name, row in (*geometry, *view)}
     names: tuple[str, ...] = ("field_table", "field_w1", "field_w2", "field_w3", "domain")
     if scene.texture != "hash":
         there = pipeline.table().keys()

@@ -11,7 +11,7 @@ from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_colors import choice_bytes
 from bitymi_ns.ops import can_rasterize, project
 from bitymi_ns.ops.capacity import NUMBERS, free_memory
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.plugin.console import say, warn

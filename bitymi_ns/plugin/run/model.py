@@ -15,8 +15,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttrib
 from torch import Tensor
 from torch.nn import Parameter
 
-from bitymi_ns.ops.project import GEOMETRY
-from bitymi_ns.ops.view_kinds import VIEW_PARAMETERS
+from bitymi_ns.ops.view_kinds import PARAMETERS
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.run.callbacks import TrainingRun
 from bitymi_ns.plugin.run.checkpoints import STATE_VERSION
@@ -33,7 +32,7 @@ from bitymi_ns.train.poses import aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
 
 _NO_OPACITY = -1e4  # logit
-PARAMETER_GROUPS = (*GEOMETRY, *VIEW_PARAMETERS, "field_table", "field_mlp")
+PARAMETER_GROUPS = (*PARAMETERS, "field_table", "field_mlp")
 """Groups with a configured optimiser; a scene has those of its view colour and texture."""
 
 

@@ -19,7 +19,7 @@ from bitymi_ns.codec.bc7_encode import bc7_encoder
 from bitymi_ns.ops import webgpu
 from bitymi_ns.ops.baked_cpu import draw as draw_on_cpu
 from bitymi_ns.ops.baked_scene import decode_bc7
-from bitymi_ns.ops.project import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.ops.webgpu import device, on_device
 from bitymi_ns.scene import Camera

@@ -2,40 +2,18 @@
 import { DamagedBundle } from '../errors';
 import type { Manifest, Vec3, ViewKind } from './manifest';
 import { Table, parsePly } from './ply';
-
-export const SURFEL_WORDS = 24;
-export const KINDS = { sv: 0, 'sv sites': 1, sh: 2, sb: 3, sg: 4 } as const; // VIEW_* of view_color.wgsl
-export const LEAN_WIDTH: Record<ViewKind, number> = { sv: 6, sh: 3, sb: 6, sg: 7 };
-const MAX_TERMS = 32;
-// Largest values, as codec/limits.py.
-export const MOST = { position: 1e9, logScale: 104, shape: 1e4, color: 256, direction: 1e6, vector: 2e7 } as const;
-export const EXTENTS: [number, number] = [1e-6, 16];
-const UNIT_SLACK = 0.01; // tolerance of a rotation's length
-const of = (size: number, count = 3): number[] => new Array<number>(count).fill(size);
-// Limits of the numbers of a term.
-export const TERM_LIMITS: Record<ViewKind | 'sv sites', number[]> = {
-  sv: [...of(MOST.vector), ...of(MOST.color)],
-  'sv sites': [...of(MOST.direction), MOST.shape, ...of(MOST.color)],
-  sh: of(MOST.color),
-  sb: [...of(MOST.color), ...of(MOST.shape)],
-  sg: [...of(MOST.direction), MOST.shape, ...of(MOST.color)],
-};
-// Offsets in a surfel, words.
-export const WORD = {
-  mean: 0,
-  opacity: 3,
-  quat: 4,
-  logScale: 8,
-  beta: 10,
-  extent: 11,
-  residual: 12,
-  layer: 15, // with the mean alpha: alphaWord
-  base: 16,
-  firstTerm: 19,
-  tile: 20,
-  sides: 22,
-  terms: 23,
-} as const;
+import {
+  EXTENTS,
+  KINDS,
+  LEAN_WIDTH,
+  LIMITS,
+  MAX_TERMS,
+  SURFEL_WORDS,
+  TERM_LIMITS,
+  UNIT_SLACK,
+  WHOLE,
+  WORD,
+} from './tables';
 
 export interface Surfels {
   count: number;
@@ -120,21 +98,6 @@ function whole(rows: Table, words: Float32Array, parts: [string, number][], base
   return out;
 }
 
-const WHOLE: Record<ViewKind, { parts: [string, number][]; base: string | null; kind: number }> = {
-  sv: {
-    parts: [
-      ['sv_sites', 3],
-      ['sv_log_tau', 1],
-      ['sv_rgb', 3],
-    ],
-    base: null,
-    kind: KINDS['sv sites'],
-  },
-  sh: { parts: [['sh_rest', 3]], base: 'sh_dc', kind: KINDS.sh },
-  sb: { parts: [['sb_lobes', 6]], base: 'sb_base', kind: KINDS.sb },
-  sg: { parts: [['sg_lobes', 7]], base: 'sg_base', kind: KINDS.sg },
-};
-
 function tiles(rows: Table, words: Float32Array, info: Manifest): void {
   const columns = ['tile_x', 'tile_y', 'tile_layer', 'tile_ru', 'tile_rv'].map((name) => {
     const column = new Int32Array(rows.count);
@@ -163,22 +126,13 @@ function alphas(rows: Table, words: Float32Array): void {
   });
 }
 
-const LIMITS: [name: string, first: number, words: number, most: number][] = [
-  ['x, y or z', WORD.mean, 3, MOST.position],
-  ['opacity', WORD.opacity, 1, MOST.shape],
-  ['scale', WORD.logScale, 2, MOST.logScale],
-  ['beta', WORD.beta, 1, MOST.shape],
-  ['residual', WORD.residual, 3, MOST.color],
-  ['view_base', WORD.base, 3, MOST.color],
-];
-
 // Checks the same limits as from_columns of bundle/surfel_table.py.
-function checkLimits(words: Float32Array, terms: Float32Array, ofTerm: number[]): void {
+function checkLimits(words: Float32Array, terms: Float32Array, ofTerm: readonly number[]): void {
   const refuse = (name: string, i: number): never => {
     throw new DamagedBundle(`surfels.ply: ${name} is beyond its limit, or no number, in row ${i}.`);
   };
   for (let i = 0, at = 0; at < words.length; i++, at += SURFEL_WORDS) {
-    for (const [name, first, count, most] of LIMITS) {
+    for (const [name, [first, count, most]] of Object.entries(LIMITS)) {
       for (let c = first; c < first + count; c++) if (!(Math.abs(words[at + c]) <= most)) refuse(name, i);
     }
     const extent = words[at + WORD.extent];
@@ -205,8 +159,8 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   ['x', 'y', 'z'].forEach((name, c) => copy(name, WORD.mean + c));
   [0, 1, 2, 3].forEach((c) => copy(`rot_${c}`, WORD.quat + c));
   [0, 1].forEach((c) => copy(`scale_${c}`, WORD.logScale + c));
-  copy('opacity', WORD.opacity);
-  copy('beta', WORD.beta);
+  copy('opacity', WORD.opacityLogit);
+  copy('beta', WORD.betaRaw);
   const extent = info.atlas?.extent ?? 3;
   if (rows.has('tile_extent')) copy('tile_extent', WORD.extent);
   else for (let at = WORD.extent; at < words.length; at += SURFEL_WORDS) words[at] = extent;
@@ -218,7 +172,7 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const form = WHOLE[info.viewColor];
   const terms = term
     ? lean(rows, new Table(data, term, 'view_term'), words, info.viewColor)
-    : whole(rows, words, form.parts, form.base);
+    : whole(rows, words, Object.entries(form.parts), form.base);
   checkLimits(words, terms, TERM_LIMITS[info.viewColor === 'sv' && !term ? 'sv sites' : info.viewColor]);
   const origin = originOf(info);
   centred(words, origin);

@@ -1,6 +1,6 @@
 // Limits of the device, checked before a scene is decoded.
 import type { Atlas, Manifest } from '../bundle/manifest';
-import { LEAN_WIDTH, SURFEL_WORDS } from '../bundle/surfels';
+import { LEAN_WIDTH, SURFEL_WORDS } from '../bundle/tables';
 import { tooLarge } from '../errors';
 
 const DECODED_NUMBERS = 19; // doubles per surfel while a compact bundle is decoded, without terms

@@ -2,7 +2,8 @@
 import { decodeBc7 } from '../bundle/bc7';
 import { type Pages, blockOf } from '../bundle/ktx2';
 import type { Manifest } from '../bundle/manifest';
-import { SURFEL_WORDS, type Surfels, WORD } from '../bundle/surfels';
+import { type Surfels } from '../bundle/surfels';
+import { SURFEL_WORDS, WORD } from '../bundle/tables';
 import { tooLarge } from '../errors';
 import type { Graphics } from './device';
 import { GROUP } from './limits';
@@ -110,7 +111,7 @@ export class SceneOnDevice {
   hide(kept: Uint8Array | null): void {
     const words = kept ? this.surfels.words.slice() : this.surfels.words;
     kept?.forEach((shown, i) => {
-      if (!shown) words[i * SURFEL_WORDS + WORD.opacity] = NO_OPACITY;
+      if (!shown) words[i * SURFEL_WORDS + WORD.opacityLogit] = NO_OPACITY;
     });
     this.shown = kept ? kept.reduce((sum, shown) => sum + shown, 0) : this.count;
     if (this.count) this.device.queue.writeBuffer(this.stored, 0, words as Float32Array<ArrayBuffer>);

@@ -1,6 +1,7 @@
 // Crops of a scene: surfels are kept or hidden by their centres, as in bitymi_ns/scene/crop.py.
 import type { Vec3 } from '../bundle/manifest';
-import { SURFEL_WORDS, type Surfels, WORD } from '../bundle/surfels';
+import { type Surfels } from '../bundle/surfels';
+import { SURFEL_WORDS, WORD } from '../bundle/tables';
 import { type Quat, axesOf } from './rotation';
 import { dot, subtract } from './vector';
 

@@ -1,6 +1,6 @@
 // Sampling of views of another size than the photographs, as bitymi_ns/scene/sampling.py.
 import type { Vec3 } from '../bundle/manifest';
-import { SURFEL_WORDS, WORD } from '../bundle/surfels';
+import { SURFEL_WORDS, WORD } from '../bundle/tables';
 import type { View } from './pose';
 import { dot } from './vector';
 

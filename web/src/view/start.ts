@@ -1,6 +1,7 @@
 // First view without cameras, and the size of the scene.
 import type { Vec3 } from '../bundle/manifest';
-import { SURFEL_WORDS, type Surfels } from '../bundle/surfels';
+import { type Surfels } from '../bundle/surfels';
+import { SURFEL_WORDS } from '../bundle/tables';
 import { type Pose, lookAt } from './pose';
 import { add, cross, length, times, unit } from './vector';
 

@@ -1,8 +1,7 @@
 // Packs tiles into the pages of an atlas from their sizes, as bitymi_ns/codec/packing.py.
 import { DamagedBundle } from '../../errors';
+import { GRID, ROWS } from '../tables';
 
-const GRID = 4;
-const ROWS = 64;
 const MOST_LAYERS = 2048;
 
 export interface Packing {

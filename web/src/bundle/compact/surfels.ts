@@ -1,34 +1,23 @@
 // Decodes surfels.bin: docs/baking.md describes its columns, codec/surfel_codes.py writes them.
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
-import { EXTENTS, KINDS, LEAN_WIDTH, MOST, SURFEL_WORDS, type Surfels, TERM_LIMITS, WORD } from '../surfels';
-import { alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
+import { type Surfels, alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
+import { ALPHA_MIN, COLOR_LIMIT, EXTENT, EXTENTS, KINDS, LEAN_WIDTH, LIMITS, MAX_TERMS } from '../tables';
+import { POSITION_BITS, SHAPES, SMALLEST_SHARE, SURFEL_WORDS, WORD } from '../tables';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
 export const SURFELS_PER_BYTE = 1; // most that a file may state, beyond SPARE_SURFELS
 export const SPARE_SURFELS = 1 << 12;
-const POSITION_BITS = 17;
-const SHARE = 1 / 1024; // margin of opacities and betas to the ends of their ranges
-const ALPHA_MIN = 1 / 255;
-const EXTENT = 3; // without a tile
 const LEAST_EXPONENT = 2; // log2 of a tile side
 const MOST_EXPONENT = 12;
-const MOST_TERMS = 32;
 const BENT = 50; // largest argument of sinh: beyond all limits
 const FILE = 'surfels.bin';
-// Numbers of a lean term that are not colours: first index, and limits.
-const SHAPES: Record<ViewKind, { at: number; limits: number[] }> = {
-  sv: { at: 0, limits: TERM_LIMITS.sv.slice(0, 3) },
-  sh: { at: 0, limits: [] },
-  sb: { at: 3, limits: TERM_LIMITS.sb.slice(3) },
-  sg: { at: 0, limits: TERM_LIMITS.sg.slice(0, 4) },
-};
 
 const clip = (x: number, low: number, high: number): number => Math.min(Math.max(x, low), high);
 const within = (x: number, limit: number): number => clip(x, -limit, limit);
 const logit = (share: number, least: number): number => {
-  const x = clip(share, least, 1 - SHARE);
+  const x = clip(share, least, 1 - SMALLEST_SHARE);
   return Math.log(x) - Math.log1p(-x);
 };
 const sinh = (x: number): number => Math.sinh(within(x, BENT));
@@ -64,9 +53,9 @@ function thirds(key: number): number {
 // Writes a colour from row i of the columns green, red - green and blue - green, the first at `at`.
 function color(to: Float32Array, first: number, of: Float64Array[], at: number, i: number, step: number): void {
   const green = of[at][i];
-  to[first] = within(step * (of[at + 1][i] + green), MOST.color);
-  to[first + 1] = within(step * green, MOST.color);
-  to[first + 2] = within(step * (of[at + 2][i] + green), MOST.color);
+  to[first] = within(step * (of[at + 1][i] + green), COLOR_LIMIT);
+  to[first + 1] = within(step * green, COLOR_LIMIT);
+  to[first + 2] = within(step * (of[at + 2][i] + green), COLOR_LIMIT);
 }
 
 class Decoder {
@@ -130,7 +119,7 @@ class Decoder {
       const [lower, upper] = [key % 2 ** 24, Math.floor(key / 2 ** 24)];
       for (let a = 0; a < 3; a++) {
         const cell = (thirds(lower >> a) & 0xff) | (thirds(upper >> a) << 8);
-        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), MOST.position);
+        this.words[to + a] = within(center[a] + scale * sinh(low[a] + step * cell), LIMITS.means[2]);
       }
     }
   }
@@ -159,10 +148,10 @@ class Decoder {
     const [residual, base] = [this.column('residual'), this.column('view_base')];
     for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
       for (let c = 0; c < 2; c++) {
-        this.words[to + WORD.logScale + c] = within(ofScale * scales[c][i], MOST.logScale);
+        this.words[to + WORD.logScale + c] = within(ofScale * scales[c][i], LIMITS.log_scales[2]);
       }
-      this.words[to + WORD.opacity] = logit(ofOpacity * opacity[i], ALPHA_MIN);
-      this.words[to + WORD.beta] = logit(ofBeta * beta[i], SHARE);
+      this.words[to + WORD.opacityLogit] = logit(ofOpacity * opacity[i], ALPHA_MIN);
+      this.words[to + WORD.betaRaw] = logit(ofBeta * beta[i], SMALLEST_SHARE);
       color(this.words, to + WORD.residual, residual, 0, i, ofResidual);
       color(this.words, to + WORD.base, base, 0, i, ofBase);
     }
@@ -207,7 +196,7 @@ class Decoder {
   private viewColors(): Float32Array {
     const kind = this.info.viewColor;
     const [[counts], shape, colors] = ['view_count', 'term_shape', 'term_color'].map((name) => this.column(name));
-    const good = kind === 'sh' ? [0, 3, 8, 15] : Array.from({ length: MOST_TERMS + 1 }, (_, k) => k);
+    const good = kind === 'sh' ? [0, 3, 8, 15] : Array.from({ length: MAX_TERMS + 1 }, (_, k) => k);
     const width = LEAN_WIDTH[kind];
     if (!counts.every((count) => good.includes(count))) {
       this.refuse('a view colour has a number of terms that none can have');

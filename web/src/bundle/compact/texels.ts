@@ -2,7 +2,8 @@
 import { DamagedBundle } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, CodedTexels } from '../manifest';
-import { SURFEL_WORDS, type Surfels, WORD, alphaIn, layerIn } from '../surfels';
+import { type Surfels, alphaIn, layerIn } from '../surfels';
+import { SURFEL_WORDS, WORD } from '../tables';
 import { ColumnReader, checkColumns } from './columns';
 
 export const TEXELS_PER_BYTE = 64; // of both files: most that they may state, beyond SPARE_TEXELS

@@ -1,0 +1,46 @@
+"""Parameters of a surfel. Names, shapes, limits, learning rates and columns follow from `GEOMETRY_PARAMETERS` and, for
+view colours, from `view_kinds.VIEW_COLORS`."""
+
+import math
+from dataclasses import dataclass
+
+Limit = tuple[float, ...]
+"""Largest absolute value of a parameter: one number, or one for each entry of its last axis."""
+SHAPE_LIMIT = 1e4  # of logits, angles and log sharpnesses: sigmoid and exp saturate far below
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter with one row per surfel."""
+
+    name: str  # as in checkpoints and optimiser groups
+    shape: tuple[int, ...]  # of a row; -1 = number of terms, less the one that the first parameter may hold
+    limit: Limit  # allowed in a bundle
+    rate: str  # learning rate, a field of `train.config.LearningRates`,
+    share: float = 1.0  # and its factor
+    activation: str | None = None  # activation of a view colour as stated in bundle.json; None: not stated
+    columns: tuple[str, ...] | None = None  # columns of surfels.ply; None: <name>_<i>
+    code: str | None = None  # column of surfels.bin; None: its name
+
+    @property
+    def width(self) -> int:
+        """Numbers per row, or per term of it."""
+        return math.prod(size for size in self.shape if size > 0)
+
+
+GEOMETRY_PARAMETERS: dict[str, Parameter] = {
+    parameter.name: parameter
+    for parameter in (
+        Parameter("means", (3,), (1e9,), "mean_pixels", columns=("x", "y", "z"), code="place"),
+        Parameter(
+            *("quats", (4,), (math.inf,), "quats"), columns=("rot_0", "rot_1", "rot_2", "rot_3"), code="rotation"
+        ),
+        # beyond, exp() is 0 or infinite in float32
+        Parameter("log_scales", (2,), (104.0,), "log_scales", columns=("scale_0", "scale_1")),
+        Parameter(*("opacity_logits", (), (SHAPE_LIMIT,), "opacity_logits"), columns=("opacity",), code="opacity"),
+        Parameter("beta_raw", (), (SHAPE_LIMIT,), "beta_raw", columns=("beta",), code="beta"),
+    )
+}
+"""Geometry of a surfel by name, in the order of the kernels."""
+GEOMETRY = tuple(GEOMETRY_PARAMETERS)
+"""Names of the surfels' geometry parameters."""

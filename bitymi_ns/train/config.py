@@ -153,9 +153,7 @@ class GuardConfig:
     """Rollback of diverged training."""
 
     rollbacks: Count = 5  # Maximum number of rollbacks; 0 = a loss that is not finite ends the run.
-    rates: PositiveShare = 0.3
-    """Factor of all learning rates after a rollback; its square, cube, ... if further rollbacks follow without a good
-    window between them."""
+    rates: PositiveShare = 0.3  # Factor of all learning rates at each rollback.
     window: PositiveCount = 300  # Steps over which the loss is averaged.
     min_window: PositiveCount = 20  # Minimum number of steps of a window, in runs of any length.
 

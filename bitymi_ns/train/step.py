@@ -311,7 +311,7 @@ class Training:
         if "guard" in state:
             self.guard.load_state_dict(state["guard"])
             if length != schedule.max_steps:
-                self.guard.restart(forget=True)  # losses at the resolution and rates of another schedule
+                self.guard.restart()  # losses at the resolution and rates of another schedule
         device = self.scene.surfels["means"].device  # a checkpoint is read on the CPU
         self.exposure.load_state_dict(state.get("exposure"), len(self._full_size), device)
         self.poses.load_state_dict(state.get("poses"))

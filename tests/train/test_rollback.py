@@ -106,78 +106,31 @@ def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
     assert trainer.training.guard.rollbacks == 1
 
 
-def test_views_drawn_worse_than_before_take_the_run_back(begun, views):
-    trainer = begun(96)
-    scene = trainer.scene
-    good, *_ = evaluate(scene, views, trainer.config)
-    assert trainer.training.guard.window == 24  # four epochs; windows end with the run
+def test_views_drawn_worse_than_blank_ones_take_the_run_back(begun, views):
+    trainer = begun(100)
+    good, *_ = evaluate(trainer.scene, views, trainer.config)
+    assert trainer.training.guard.window == 20  # windows end with the run
     with torch.no_grad():
-        scene.surfels["sv_rgb"] += 0.3
-    damaged, *_ = evaluate(scene, views, trainer.config)
-    with pytest.warns(UserWarning, match="step 119: training diverged .the views are drawn worse than before"):
-        for _ in range(24):
+        trainer.scene.surfels["sv_rgb"] += 5.0
+    with pytest.warns(UserWarning, match="step 119: training diverged .the views are drawn worse than blank ones"):
+        for _ in range(20):
             trainer.advance()
-    assert evaluate(scene, views, trainer.config)[0] > damaged + 3 and damaged < good - 3
     assert trainer.training.guard.rollbacks == 1
-
-
-@pytest.mark.slow
-def test_rates_return_to_normal_after_a_good_window_but_once(begun):
-    trainer = begun(50)
-    guard = trainer.training.guard
-
-    def break_the_field() -> None:
-        with torch.no_grad():
-            trainer.scene.field.field_w3[4] = math.nan
-        run(trainer, 1)
-
-    break_the_field()
-    assert guard.factor == pytest.approx(0.3)
-    with pytest.warns(UserWarning, match="learning rates return to normal"):
-        for _ in range(2 * guard.window):
-            trainer.advance()
-    assert guard.factor == 1.0 and guard.rollbacks == 1
-    break_the_field()
-    run(trainer, 120 - trainer.step)
-    assert guard.rollbacks == 2 and guard.factor == pytest.approx(0.3)
+    assert evaluate(trainer.scene, views, trainer.config)[0] > good - 3
 
 
 def test_texels_begin_a_window_of_their_own(make_scene, views):
-    """A rise of the loss at the start of texels is compared with earlier losses only if it lasts."""
+    """States from before have no texels."""
     config = config_of()
     config.texels.start = 18_000
     trainer = Trainer(make_scene(texture=False, config=SceneConfig(texture="texels")), views, config, 250)
     start, guard = trainer.training.schedule.texels_start, trainer.training.guard
     run(trainer, start)
-    counted, best = guard._count, guard._best
-    assert counted > 0 and math.isfinite(best)
+    assert guard._states[0][0] < start
     run(trainer, 1)
-    assert guard._count == 1 and guard._best == best
+    assert guard._count == 1 and guard._states[0][0] == start
     run(trainer, 250 - trainer.step)
     assert guard.rollbacks == 0
-
-
-def test_losses_are_compared_across_resolutions(make_scene, views):
-    """Small pictures have smaller losses here, as they are smaller than a window of SSIM."""
-    scene, config = make_scene(), config_of()
-    config.resolution_schedule, config.num_downscales = 12_000, 3
-    trainer = Trainer(scene, views, config, 120)
-    run(trainer, 119)
-    assert trainer.training.guard.rollbacks == 0 and math.isfinite(trainer.training.guard._best)
-    at_full_size = trainer.training.guard._loss_of(trainer.training.views, 1.0)
-    assert 0.5 * at_full_size < trainer.training.guard._best < 2 * at_full_size
-
-
-def test_nothing_is_compared_with_before_where_the_resolution_changes_in_a_faded_scene(make_scene, views):
-    scene, config = make_scene(), config_of()
-    config.resolution_schedule, config.num_downscales = 12_500, 1
-    config.densify.min_reset_interval = 1  # resets after steps 12, 24, ...
-    trainer = Trainer(scene, views, config, 120)
-    assert 48 in trainer.training.schedule.reset_steps and trainer.training.schedule.recovering(50)
-    trainer.training.guard.before(0, trainer.training.views)
-    trainer.training.guard._best = 0.1
-    trainer.training.guard._convert(49)
-    assert trainer.training.guard._best == math.inf
 
 
 def test_a_few_broken_surfels_are_dropped_and_many_take_the_run_back(begun):
@@ -201,7 +154,7 @@ def test_a_few_broken_surfels_are_dropped_and_many_take_the_run_back(begun):
 
 def test_it_does_not_go_back_for_ever(begun):
     trainer = begun(5, config=config_of(rollbacks=2, rates=0.5))
-    with pytest.raises(TrainingDiverged, match="It went back 2 times, to learning rates times 0.12. Lower"):
+    with pytest.raises(TrainingDiverged, match="It went back 2 times, to learning rates times 0.25. Lower"):
         for _ in range(3):
             with torch.no_grad():
                 trainer.scene.field.field_w1[0] = math.inf

@@ -268,10 +268,8 @@ def _check_run(run: Entry, rows: int, step: int) -> None:
     if (guard := run.get("guard")) is not None:
         for name in ("factor", "limit", "sum"):
             guard[name].number()
-        for name in ("rollbacks", "streak", "count"):
+        for name in ("rollbacks", "count"):
             guard[name].count()
-        if (best := guard.get("best")) is not None:
-            best.number()
     for name in ("seconds", "cpu_seconds"):
         run[name].number(0.0, 1e12)
     if (capture := run.get("capture")) is not None:

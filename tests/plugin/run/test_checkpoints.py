@@ -45,15 +45,7 @@ def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
     exposure._begin(torch.zeros(3, 3), affine=True)
     run = {
         "strategy": {name: torch.zeros(rows) for name in STATISTICS} | {"generator": torch.Generator().get_state()},
-        "guard": {
-            "factor": 1.0,
-            "rollbacks": 0,
-            "streak": 0,
-            "limit": math.nan,
-            "best": math.inf,
-            "sum": 0.0,
-            "count": 0,
-        },
+        "guard": {"factor": 1.0, "rollbacks": 0, "limit": math.nan, "sum": 0.0, "count": 0},
         "step_sizes": {"footprints": torch.ones(rows)},
         "poses": {"motions": torch.zeros(3, 6).double()},
         "exposure": exposure.state_dict() | {"decided": True, "finding": "as asked for"},

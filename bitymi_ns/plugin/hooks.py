@@ -2,7 +2,6 @@
 the rest. Each function states what it changes, for which commands, what is lost without it, and what would end it."""
 
 import os
-import re
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -12,13 +11,10 @@ from pathlib import Path
 from types import FrameType, SimpleNamespace, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
-import rich
 from nerfstudio.configs import external_methods
 from nerfstudio.configs.base_config import ViewerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 from rich.errors import MarkupError
-from rich.markup import escape
-from rich.panel import Panel
 
 from bitymi_ns import exit_messages
 from bitymi_ns.bundle.manifest import MANIFEST
@@ -44,13 +40,6 @@ REFUSED = {
     "ExportGaussianSplat": f"ns-export gaussian-splat is for splatfacto. {_MESH}",
 }
 """Classes of nerfstudio's scripts that cannot work on surfels, and remedies."""
-REMARKS = re.compile(
-    r"Saving config to|Saving checkpoints to"  # the run's own summary says where
-    r"|Mixed precision is disabled|Auto image downscale factor of 1$"
-    r"|\[NOTE\] Not running eval iterations"  # the training curve is of held-out views
-    r"|\[bold yellow\]Disabled comet|disabled local writer"
-)
-"""Beginnings of dropped lines; others may be about the capture."""
 COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 EXPORTER, VIEWER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.viewer.run_viewer"
 LOOPBACK = "127.0.0.1"  # reachable from this machine alone, unlike nerfstudio's default 0.0.0.0
@@ -348,53 +337,25 @@ def patch_render() -> None:
 
 
 @contextmanager
-def filter_console() -> Iterator[None]:
-    """Drop REMARKS, the viewer server's box with its address, and torch's warnings about nerfstudio's code; restore all
-    afterwards.
+def print_brackets() -> Iterator[None]:
+    """Have nerfstudio's console print a line whose brackets are no markup as it is.
 
-    Changes: `print` and `log` of nerfstudio's console, and rich's `print`. For: ns-train. Without: the run's own lines
-    are lost in a screen of others, and a bracket in a path ends it. Superfluous once nerfstudio logs by levels.
+    Changes: `print` and `log` of the console, for a while. For: ns-train. Without: a bracket in a path ends the run.
+    Superfluous once nerfstudio escapes what it prints.
     """
+    stock = {name: getattr(CONSOLE, name) for name in ("print", "log")}
 
-    def remark(said: Any) -> bool:
-        return isinstance(said, str) and REMARKS.match(said) is not None
-
-    def box(said: Any) -> bool:
-        return isinstance(said, Panel) and "viser" in str(said.title)
-
-    with (
-        ignore_torch_warnings(),
-        _dropping(CONSOLE, "print", remark),
-        _dropping(CONSOLE, "log", remark, _stack_offset=2),  # it states its caller
-        _dropping(rich, "print", box),
-    ):
-        yield
-
-
-@contextmanager
-def ignore_torch_warnings() -> Iterator[None]:
-    """Ignore torch's warnings about nerfstudio's code: no user can act on them."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
-        warnings.filterwarnings("ignore", "Converting a tensor with requires_grad", UserWarning, module="nerfstudio")
-        yield
-
-
-@contextmanager
-def _dropping(owner: Any, name: str, dropped: Callable[[Any], bool], **always: Any) -> Iterator[None]:
-    """Drop calls of `owner`'s function `name` by their first argument."""
-    write = getattr(owner, name)
-
-    def filtered(*said: Any, **options: Any) -> None:
-        if said and dropped(said[0]):
-            return
+    def write(name: str, *said: Any, **options: Any) -> None:
+        options |= {"_stack_offset": 2} if name == "log" else {}  # it states its caller
         try:
-            write(*said, **{**always, **options})
-        except MarkupError:  # brackets in a path
-            write(*map(escape, map(str, said)), **{**always, **options})
+            stock[name](*said, **options)
+        except MarkupError:
+            stock[name](*said, **{**options, "markup": False})
 
-    setattr(owner, name, filtered)
     try:
+        for name in stock:
+            setattr(CONSOLE, name, partial(write, name))
         yield
     finally:
-        setattr(owner, name, write)
+        for name, function in stock.items():
+            setattr(CONSOLE, name, function)

@@ -25,7 +25,7 @@ from bitymi_ns import exit_messages, files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
-from bitymi_ns.plugin.hooks import filter_console, ignore_torch_warnings
+from bitymi_ns.plugin.hooks import print_brackets
 from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.plugin.run.model import BitymiModel
@@ -68,14 +68,14 @@ class BitymiTrainer(Trainer):
 
     def __init__(self, config: TrainerConfig, **alone: Any) -> None:
         here = torchrun.own("LOCAL_")  # nerfstudio did not start the process and passes rank 0 of 1
-        with filter_console():
+        with print_brackets():
             super().__init__(config, here.rank, here.count)
         self.processes = torchrun.own()
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         self._stop_requested = 0.0  # time.monotonic() of the first signal; 0 = none
         try:
-            with filter_console():
+            with print_brackets():
                 super().setup(test_mode)
         except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
@@ -152,7 +152,7 @@ class BitymiTrainer(Trainer):
         previous = self._catch_interrupt()
         try:
             self.config.max_num_iterations = total - self._start_step
-            with ignore_torch_warnings(), step_bar(self._start_step, total) as self._show_step:
+            with print_brackets(), step_bar(self._start_step, total) as self._show_step:
                 super().train()
         except _StopAfterStep:
             self.save_checkpoint(self.step)

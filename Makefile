@@ -10,7 +10,7 @@
 # make wheel-test  builds the wheel, without CUDA, looks into it and runs tests against it in an environment of its own
 # make test-environment  installs the wheel beside the oldest and the newest packages, runs tests and commands there, and
 #              records the versions (8 GB and half an hour each); ENDS=oldest or newest: one of them; DATA=capture
-# make wheel   builds a wheel in dist/; with CUDA=1 one that has the kernels for cards of compute capability 7.5 to 12.0
+# make wheel   builds a wheel in dist/; with CUDA=1 one that has the kernels for GPUs of compute capability 7.5 to 12.0
 #              (ARCHITECTURES) and needs nvcc here, not where it is installed
 # make gate    trains, bakes and draws a fixed small scene (and DATA=folder) and compares quality, bytes, memory and time
 #              with the committed baseline, benchmarks/gate.json; make gate-accept renews the baseline
@@ -41,8 +41,8 @@ TORCH       := torch==2.13.0
 TORCHVISION := torchvision==0.28.0
 CPU_INDEX   := https://download.pytorch.org/whl/cpu
 CXX_FILES   := $(shell find csrc -name '*.cpp' -o -name '*.h' -o -name '*.cu')
-# The CUDA kernels are built where nvcc is found: for the cards of this machine, for one architecture where there is no
-# card and they can only be compiled. They are also built for the host, so that the tests run them without a card.
+# The CUDA kernels are built where nvcc is found: for the GPUs of this machine, for one architecture where there is no
+# GPU and they can only be compiled. They are also built for the host, so that the tests run them without a GPU.
 DEFINE      := --config-settings=cmake.define
 CMAKE_ARGS  := $(DEFINE).BITYMI_EMULATED_CUDA=ON \
   $(if $(shell command -v nvidia-smi),,$(DEFINE).BITYMI_CUDA_ARCHITECTURES=90)

@@ -62,11 +62,11 @@ def main(parser: Arguments, words: Sequence[str]) -> None:
     parser.add_argument("--sizes", nargs="+", type=image_size, default=SIZES, metavar="WxH", help="(%(default)s)")
     parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes to draw as well")
     parser.add_argument("--runs", type=int, default=200, help="timed frames, after ten untimed ones (%(default)s)")
-    parser.add_argument("--emulated", action="store_true", help="try the script without a card")
+    parser.add_argument("--emulated", action="store_true", help="try the script without a GPU")
     parser.add_output()
     arguments = parser.parse_args(words)
     surfels, sizes, options = [60], [(40, 24)], Options(torch.device("cpu"), 0, 1)
-    notes = ["No card: kernels emulated on the host, times mean nothing."]
+    notes = ["No GPU: kernels emulated on the host, times mean nothing."]
     if not arguments.emulated:
         surfels, sizes, options = arguments.surfels, arguments.sizes, Options(parser.device(), 10, arguments.runs)
         notes = [f"{torch.cuda.get_device_name(options.device)}, CUDA {torch.version.cuda}: medians, see `--help`."]

@@ -13,7 +13,7 @@ if(BITYMI_EMULATED_CUDA)
     file(CONFIGURE OUTPUT ${wrapper} CONTENT "#include \"cuda/${name}.cu\"\n")
     list(APPEND emulated_kernels ${wrapper})
   endforeach()
-  # what a card would refuse; the emulator says where
+  # what a GPU would refuse; the emulator says where
   set_source_files_properties(${emulated_kernels} PROPERTIES COMPILE_OPTIONS -fsanitize=alignment)
   nanobind_add_module(_emulated NB_STATIC NOMINSIZE NB_DOMAIN _emulated ${emulated_sources} ${emulated_kernels} ${cuda_bindings})
   target_include_directories(_emulated PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/csrc)
@@ -38,7 +38,7 @@ elseif(note)
 endif()
 # pip hides the lines above: the package says why.
 file(CONFIGURE OUTPUT ${CMAKE_CURRENT_BINARY_DIR}/_cuda_build.py @ONLY CONTENT [[
-"""Why there are no CUDA kernels (empty: there are), and what this machine's cards lack. Written by CMake."""
+"""Why there are no CUDA kernels (empty: there are), and what this machine's GPUs lack. Written by CMake."""
 
 WHY_NOT = r"""@why@"""
 NOTE = r"""@note@"""
@@ -48,7 +48,7 @@ if(why)
   return()
 endif()
 
-# Before the language is enabled: CMake would choose an architecture itself. Machine code for each; what later cards
+# Before the language is enabled: CMake would choose an architecture itself. Machine code for each; what later GPUs
 # compile it from (PTX) for the newest alone.
 set(CMAKE_CUDA_ARCHITECTURES ${BITYMI_CUDA_ARCHITECTURES})
 list(POP_BACK CMAKE_CUDA_ARCHITECTURES newest)

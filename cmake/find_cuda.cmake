@@ -1,5 +1,5 @@
 # Sets `why` to the reason why no kernels can be built, with a remedy; else the compilers, BITYMI_CUDA_ARCHITECTURES, and
-# `note` if a card of this machine gets less than it could.
+# `note` if a GPU of this machine gets less than it could.
 function(find_cuda)
   if(BITYMI_CUDA STREQUAL "OFF")
     set(why "it was built with BITYMI_CUDA=OFF: leave that out and install bitymi-ns again" PARENT_SCOPE)
@@ -73,9 +73,9 @@ CUDAHOSTCXX, and install bitymi-ns again" PARENT_SCOPE)
     endforeach()
     list(APPEND built ${best})
     if(card LESS 75)
-      set(note "a card of compute capability ${card} cannot be used: the kernels need 75, a card of 2018 or later")
+      set(note "a GPU of compute capability ${card} cannot be used: the kernels need 75, a GPU of 2018 or later")
     elseif(no_card EQUAL 0 AND NOT best EQUAL card)
-      set(note "a card of compute capability ${card} is newer than ${nvcc}: the driver compiles the kernels for ${best} \
+      set(note "a GPU of compute capability ${card} is newer than ${nvcc}: the driver compiles the kernels for ${best} \
 at their first use; install a newer toolkit, and bitymi-ns again, to have them ready")
     endif()
   endforeach()

@@ -311,7 +311,7 @@ def _encode_blocks(texels: Tensor, alpha: bool) -> Tensor | None:
         if not isinstance(error.__cause__, ImportError):
             raise
         warnings.warn(
-            f"the texels stay decoded, {texels.numel() / 1e6:.0f} MB on the card where BC7 takes a quarter: the "
+            f"the texels stay decoded, {texels.numel() / 1e6:.0f} MB on the GPU where BC7 takes a quarter: the "
             "encoder is not installed (pip install ispc_texcomp)",
             stacklevel=2,
         )

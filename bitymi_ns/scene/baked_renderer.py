@@ -45,7 +45,7 @@ class BakedRenderer:
         if not cuda_backend(device):
             raise RuntimeError("the scene is on the CPU: move it to a CUDA device, or use BakedScene.render")
         if graph and device.type != "cuda":
-            raise ValueError("CUDA graphs need a card")
+            raise ValueError("CUDA graphs need a GPU")
         self._scene, self._surfels = compiled(scene), len(scene)
         self.images = empty_images(images, views, width, height, device)
         self.workspace = Workspace(device)

@@ -172,7 +172,7 @@ bool draws_bc7() {
 AtlasTexture::AtlasTexture(TexelFormat format, int height, int width, const void* texels) {
   check_size(height, width);
   if (format == TexelFormat::kBc7 && !draws_bc7())
-    throw std::runtime_error("this card draws no BC7 textures: decode the blocks first");
+    throw std::runtime_error("this GPU draws no BC7 textures: decode the blocks first");
   check(cudaGetDevice(&device_), "current device");
   cudaArray_t array = nullptr;
   try {

@@ -29,7 +29,7 @@ std::string device_problem(int device) {
     int major = 0, minor = 0;
     cudaDeviceGetAttribute(&major, cudaDevAttrComputeCapabilityMajor, device);
     cudaDeviceGetAttribute(&minor, cudaDevAttrComputeCapabilityMinor, device);
-    problem = "the kernels were built for the compute capabilities " BITYMI_ARCHITECTURES ", and this card has " +
+    problem = "the kernels were built for the compute capabilities " BITYMI_ARCHITECTURES ", and this GPU has " +
               std::to_string(major) + std::to_string(minor) +
               ": install bitymi-ns again on this machine, or with -Ccmake.define.BITYMI_CUDA_ARCHITECTURES=" +
               std::to_string(major) + std::to_string(minor);

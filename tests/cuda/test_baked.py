@@ -247,7 +247,7 @@ def test_pixels_end_at_the_least_transmittance(least: float, share: tuple, devic
 @pytest.mark.parametrize("views", [1, 2])
 def test_recorded_graph(views: int, device: torch.device) -> None:
     if device.type != "cuda":
-        with pytest.raises(ValueError, match="card"):
+        with pytest.raises(ValueError, match="GPU"):
             BakedRenderer(textured(4, 0), 8, 8, graph=True)
         return
     scene = textured(50, 7).to(device)

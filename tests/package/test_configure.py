@@ -92,8 +92,8 @@ FAILS = "echo 'fatal error: no lib' >&2; exit 1"
         ("13.0", NEW, "", "[N/A]", "75;90;120", ""),
         ("13.0", NEW, "", "10.3\\n7.5", "75;103", ""),
         ("11.8", OLD, "", "12.0", "90", "capability 120 is newer than nvcc 11.8 (BIN/nvcc): the driver"),
-        ("11.8", OLD, "", "6.1", "", "a card of compute capability 61 cannot be used: the kernels need 75"),
-        ("11.8", OLD, "", "6.1\\n8.6", "86", "a card of compute capability 61 cannot be used"),
+        ("11.8", OLD, "", "6.1", "", "a GPU of compute capability 61 cannot be used: the kernels need 75"),
+        ("11.8", OLD, "", "6.1\\n8.6", "86", "a GPU of compute capability 61 cannot be used"),
         ("11.8", OLD, REFUSES, "8.6", "86", "host g++-11"),
         ("11.8", OLD, REFUSES.replace("g++-11", "no"), "8.6", "", "unsupported GNU version! later than 11: install"),
         ("11.8", OLD, FAILS, "8.6", "", "cannot compile with BIN/g++: fatal error: no lib: install a g++"),
@@ -135,4 +135,4 @@ def test_cuda_kernels_for_two_kinds_of_cards(tmp_path: Path) -> None:
     compiled = "CMakeFiles/bitymi_cuda.dir/csrc/cuda/device_check.cu.o"
     done = subprocess.run([str(NINJA), "-C", str(tmp_path), compiled], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout
-    assert b"compute capabilities 80, 90, and this card has" in (tmp_path / compiled).read_bytes()
+    assert b"compute capabilities 80, 90, and this GPU has" in (tmp_path / compiled).read_bytes()

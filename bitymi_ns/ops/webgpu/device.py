@@ -38,7 +38,7 @@ def device() -> Any:
     if not found:
         raise WebGpuUnavailable(
             "no graphics device for WebGPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Debian "
-            "and Ubuntu: apt install mesa-vulkan-drivers, which also draws without a card)"
+            "and Ubuntu: apt install mesa-vulkan-drivers, which also draws without a GPU)"
         )
     adapter = min(found, key=lambda a: rank.get(a.info["adapter_type"], 3))
     try:

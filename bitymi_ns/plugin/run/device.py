@@ -32,7 +32,7 @@ def why_not_cuda(index: int | None = None) -> str | None:
 
 def built(name: str) -> str:
     """Return WHY_NOT or NOTE of `_cuda_build`, which cmake/cuda.cmake writes: why there are no CUDA kernels, and which
-    cards get less than they could."""
+    GPUs get less than they could."""
     try:
         return getattr(importlib.import_module("bitymi_ns._cuda_build"), name)
     except ImportError:  # of an earlier version, installed in place

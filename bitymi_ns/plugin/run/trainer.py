@@ -133,7 +133,7 @@ class BitymiTrainer(Trainer):
         except ProcessesApart as error:
             fail(f"training cannot go on at step {self.step}: {error}.", error)
         finally:
-            # a card that waits for a lost process would block this: it is freed when this process ends
+            # a GPU that waits for a lost process would block this: it is freed when this process ends
             if dist.is_initialized() and (orderly or self.config.machine.device_type != "cuda"):
                 dist.destroy_process_group()
             run_folder.leave(self.base_dir)

@@ -35,10 +35,10 @@ def test_a_usable_card_is_used(card: ModuleType) -> None:
 def test_a_card_that_the_kernels_cannot_run_on_is_left_alone_with_one_message(
     card: ModuleType, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    card.device_problem = lambda number: "the kernels were built for 90, and this card has 75: install again"
+    card.device_problem = lambda number: "the kernels were built for 90, and this GPU has 75: install again"
     for _ in range(2):
         assert device.kernel_device("cuda").type == "cpu"
-    assert " ".join(capsys.readouterr().out.split()).count("and this card has 75: install again") == 1
+    assert " ".join(capsys.readouterr().out.split()).count("and this GPU has 75: install again") == 1
 
 
 def test_why_a_card_is_not_used(card: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ import os
 import struct
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +29,6 @@ MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a tw
 PROBE = 1 << 20  # bytes to write to find out why writing failed
 TINY = 1e-100  # least length of a quaternion that can be normalised
 CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
-T = TypeVar("T")
 
 
 class ModelImage(NamedTuple):
@@ -56,8 +55,7 @@ class Model(NamedTuple):
 def read_model(folder: Path) -> Model:
     """Read a model; of both forms the text, as nerfstudio does, with a warning if they differ. The last model is
     cached, because a run reads it several times. Raises CaptureError: it cannot be used; names file and entry."""
-    names = [f"{name}{form}" for name in ("cameras", "images", "frames", "points3D") for form in FORMS]
-    files = [*(folder / name for name in names), folder / "points3D.ply"]
+    files = [folder / f"{name}{form}" for name in TEXT for form in (*FORMS, ".ply")]
     stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
     return _read_model(folder, stamps)
 
@@ -65,20 +63,20 @@ def read_model(folder: Path) -> Model:
 @functools.lru_cache(maxsize=1)
 def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
     path = _file(folder, "cameras")
-    cameras = _parsed(path, _cameras_text, _cameras_binary, dict)
+    cameras = dict(_parsed(path))
     _check_cameras(path, cameras)
     path = _file(folder, "images")
-    images = _parsed(path, _images_text, _images_binary, dict)
+    images = dict(_parsed(path))
     _check_images(path, images, cameras)
     path = path.with_stem("frames")
     if path.is_file():  # of COLMAP 4, whose images keep poses of their own
-        frames = _parsed(path, _frames_text, _frames_binary, dict)
+        frames = dict(_parsed(path))
         images = {number: image._replace(frame=frames.get(number)) for number, image in images.items()}
     _warn_of_other_form(folder, cameras, len(images))
     path = _file(folder, "points3D")
     xyz, rgb, without_colors = np.zeros((0, 3)), np.zeros((0, 3), np.uint8), ""
     if path.is_file():
-        xyz, rgb, without_colors = _parsed(path, _points_text, _points_binary, tuple)
+        xyz, rgb, without_colors = _parsed(path)
         finite = np.isfinite(xyz).all(1)
         if not finite.all():
             first = f"the first is point {np.argmin(finite) + 1}"
@@ -96,19 +94,12 @@ forget_model = _read_model.cache_clear
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Write a model in binary form, and read it back, because COLMAP ignores failed writes; not with COLMAP, whose
     reader does not end on some truncated files. Raises OSError: a file is incomplete."""
-    readers = {
-        "rigs": _rigs_binary,
-        "cameras": _cameras_binary,
-        "frames": _frames_binary,
-        "images": _images_binary,
-        "points3D": _points_binary,
-    }
     try:
         model.write_binary(folder)
-        for name, read in readers.items():
+        for name, read in BINARY.items():
             tuple(read(folder / f"{name}.bin"))
     except (ValueError, struct.error) as error:
-        for name in readers:  # COLMAP has lost the reason: write more to have it reported
+        for name in BINARY:  # COLMAP has lost the reason: write more to have it reported
             with open(folder / f"{name}.bin", "ab") as file:
                 file.write(bytes(PROBE))
                 file.flush()
@@ -136,26 +127,21 @@ def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: 
     if count != images:
         differences.append(f"{images} images in text and {count} in binary form")
     path = folder / "cameras.bin"
-    if path.is_file() and _parsed(path, _cameras_text, _cameras_binary, dict) != cameras:
+    if path.is_file() and dict(_parsed(path)) != cameras:
         differences.append("other cameras in text than in binary form")
     if differences:
         advice = "To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
         warn(f"{folder} holds two models: {' and '.join(differences)}. The text is read. {advice}")
 
 
-def _parsed(
-    path: Path,
-    text: Callable[[Path], Iterable[Any]],
-    binary: Callable[[Path], Iterable[Any]],
-    collect: Callable[[Iterable[Any]], T],
-) -> T:
-    """Parse and collect the content of a file; report errors by its name."""
+def _parsed(path: Path) -> list[Any]:
+    """Parse a file of a model; report errors by its name."""
     if not os.path.lexists(path):
         fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.")
     hint = "It is cut off or damaged. " * (path.suffix == ".bin")
     hint += "Each image has two lines; the second, of its 2D points, may be empty. " * (path.name == "images.txt")
     with parsing(path, f"{hint}Copy the model again, or export it from COLMAP again."):
-        return collect((text if path.suffix == ".txt" else binary)(path))
+        return list((TEXT if path.suffix == ".txt" else BINARY)[path.stem](path))
 
 
 @functools.cache
@@ -346,3 +332,14 @@ def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.ui
         return np.array(rows).reshape(-1, 3), np.zeros((0, 3), np.uint8), "its points have none" * bool(rows)
     values = np.array(rows)
     return values[:, :3], *color_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))
+
+
+Reader = Callable[[Path], Iterable[Any]]
+TEXT: dict[str, Reader] = {
+    "cameras": _cameras_text, "frames": _frames_text, "images": _images_text, "points3D": _points_text,
+}  # fmt: skip
+BINARY: dict[str, Reader] = {
+    "rigs": _rigs_binary, "cameras": _cameras_binary, "frames": _frames_binary, "images": _images_binary,
+    "points3D": _points_binary,
+}  # fmt: skip
+"""Readers of a model's files by name."""

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.colmap_model import Model, ModelImage, read_model
+from bitymi_ns.capture.colmap_model import Model, read_model
 from bitymi_ns.capture.find_files import FileFinder, report_renamed
 from bitymi_ns.capture.folder_contents import images_of, photographs_below, photographs_in, result_in
 from bitymi_ns.capture.image_files import image_size, in_proportion
@@ -91,11 +91,8 @@ def _find_folder(
             return capture / stated
         advice = f"Give it, seen from {capture}, with --images-path, or leave that out to have it found."
         fail(f"the folder of photographs {capture / stated} does not exist. {advice}")
-    bases = [capture]
-    if folder.is_relative_to(capture):
-        bases += [path for path in folder.parents if path.is_relative_to(capture) and path != capture]
-    if folder == capture:
-        bases += folder.parents[:3]
+    bases = [capture, *(path for path in folder.parents if path.is_relative_to(capture) and path != capture)]
+    bases += folder.parents[:3] if folder == capture else ()
     folders = [*images_of(folder), *(base / name for base in bases for name in USUAL_FOLDERS)]
     folders += [path for path in sorted(capture.iterdir()) if path.is_dir() and not result_in(path)]
     folders += bases
@@ -147,21 +144,14 @@ def photographs_of(source: Source) -> list[Photograph]:
     """List the photographs of a model in the order of their names, with cameras and poses."""
     model, found = source.model, []
     for image, file in zip(model.images, source.files(), strict=True):
-        camera, pose = model.cameras[image.camera_id], TO_Z_UP @ _camera_to_world(image)
+        w, *xyz = image.qvec / np.linalg.norm(image.qvec)
+        to_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*xyz, w])), image.tvec).inverse().matrix()
+        pose = TO_Z_UP @ np.concatenate([to_world, [[0.0, 0.0, 0.0, 1.0]]]) @ OPENCV_AXES
         label = f"camera {image.camera_id} of {source.folder}"
-        found.append(Photograph(file, camera, pose, label, frame=image.frame))
+        found.append(Photograph(file, model.cameras[image.camera_id], pose, label, frame=image.frame))
     return found
 
 
 def model_points(model: Model, frame: Pose) -> Points:
     """Transform a model's points by [4, 4] float64."""
     return Points(model.xyz @ frame[:3, :3].T + frame[:3, 3], model.rgb)
-
-
-def _camera_to_world(image: ModelImage) -> Pose:
-    """Compute the camera-to-world matrix [4, 4] for nerfstudio's camera axes (x right, y up, z backward)."""
-    w, *xyz = image.qvec / np.linalg.norm(image.qvec)
-    rotation = pycolmap.Rotation3d(np.array([*xyz, w])).matrix()
-    c2w = np.eye(4)
-    c2w[:3, :3], c2w[:3, 3] = rotation.T, -rotation.T @ image.tvec
-    return c2w @ OPENCV_AXES

@@ -7,14 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.types import warn
 from bitymi_ns.files import write_file
 from bitymi_ns.safe_reading import read_json
 
-EARTH = 6378137.0  # equatorial radius in metres, WGS 84
-FLATTENING = 1 / 298.257223563
 GPS_ERROR = 5.0  # of phones, metres
 LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions that determines the scale, metres
 AGREEMENTS = (1.0, 2.5, GPS_ERROR, 2 * GPS_ERROR)  # distances in metres within which positions may agree
@@ -68,20 +67,15 @@ def gps_line(folder: Path) -> str:
 def local_positions(
     gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
-    """Convert GPS positions (latitude, longitude and altitude by name) to east, north and up in metres from their
-    middle; return that, too."""
+    """Convert GPS positions (latitude, longitude and altitude by name) to east, north and up in metres at their middle;
+    return that, too."""
     if not gps:
         return {}, None
     values = np.array(list(gps.values()))
     if np.ptp(values[:, 1]) > 180:  # on both sides of the antimeridian
         values[:, 1] %= 360
     middle = np.median(values, axis=0)
-    latitude = np.radians(middle[0])
-    eccentricity = FLATTENING * (2 - FLATTENING)
-    w = 1 - eccentricity * np.sin(latitude) ** 2
-    north = EARTH * (1 - eccentricity) / w**1.5
-    east = EARTH / np.sqrt(w) * np.cos(latitude)
-    local = np.column_stack([np.radians(values[:, 1::-1] - middle[1::-1]) * (east, north), values[:, 2] - middle[2]])
+    local = pycolmap.GPSTransform().ellipsoid_to_enu(values, *middle)
     middle[1] -= 360 * (middle[1] > 180)
     return dict(zip(gps, local.tolist(), strict=True)), tuple(middle.tolist())
 
@@ -91,15 +85,10 @@ def move_to_world(
     gps: Mapping[str, tuple[float, float, float]],
     ups: Mapping[str, tuple[float, float, float]] | None = None,
 ) -> WorldFrame:
-    """Transform a model in place to a world with z up.
-
-    Up is that of the accelerometers if most agree and GPS's up, if known, is within 45 degrees of it; else GPS's if its
-    positions determine it, else the cameras' mean. Scale and north are GPS's if its positions determine them.
-
-    Args:
-        gps: latitude, longitude and altitude by name.
-        ups: unit vectors away from the ground by name, in the cameras' axes (x right, y down, z forward).
-    """
+    """Transform a model in place to a world with z up. Up is that of the accelerometers if most agree and GPS's up, if
+    known, is within 45 degrees of it; else GPS's if its positions determine it, else the cameras' mean. Scale and north
+    are GPS's if its positions determine them. `gps`: latitude, longitude and altitude by name; `ups`: unit vectors away
+    from the ground, in the cameras' axes (OpenCV)."""
     up = _by_gravity(model, ups or {})
     local, origin = local_positions(gps)
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
@@ -110,7 +99,8 @@ def move_to_world(
         similarity, agree = found
         source, by_phones = "gps", None if up is None else similarity.rotation.matrix() @ up
         if by_phones is not None and by_phones @ UP > STEEPEST:
-            turn = pycolmap.Rotation3d(_smallest_turn(by_phones, np.array(UP)))
+            turn, _ = Rotation.align_vectors(UP, by_phones)  # the smallest one
+            turn = pycolmap.Rotation3d(turn.as_matrix())
             source, similarity = "gravity", pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
         model.transform(similarity)
         error = float(np.median(_gps_errors(similarity, placed, positions)[agree]))
@@ -139,13 +129,6 @@ def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, f
         return None
     up = directions[most].mean(axis=0)
     return up / np.linalg.norm(up)
-
-
-def _smallest_turn(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Make the smallest rotation [3, 3] from one unit vector to another, not its opposite."""
-    axis, cosine = np.cross(start, end), float(start @ end)
-    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + cosine)
 
 
 def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d, np.ndarray] | None:

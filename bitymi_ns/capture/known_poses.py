@@ -13,7 +13,7 @@ from bitymi_ns.capture.cache import content_key, emptied, made_once, replace_sta
 from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.image_files import from_header, image_size, read_image
-from bitymi_ns.capture.masks import colmap_mask
+from bitymi_ns.capture.masks import write_colmap_masks
 from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
@@ -29,14 +29,10 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
 def triangulate(
     capture: Path, views: Sequence[Photograph], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs with known cameras, in pixels of the files, which are not refined. The model
-    is cached, and an interrupted run resumed, in the folder `capture` as by `find_poses`. Raises CaptureError: too few
-    points can be found; says what may be wrong; KeyboardInterrupt: Ctrl-C; what is done is kept.
-
-    Returns:
-        folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in the world of the poses, with image names
-        relative to `capture`.
-    """
+    """Triangulate points from photographs with known cameras, in pixels of the files, which are not refined; return the
+    folder of a COLMAP model in the world of the poses, with image names relative to `capture`. The model is cached, and
+    an interrupted run resumed, as by `find_poses`. Raises CaptureError: too few points can be found; says what may be
+    wrong; KeyboardInterrupt: Ctrl-C; what is done is kept."""
     check_photographs_exist(capture, [view.file for view in views])
     if len(views) < 2:
         raise CaptureError(f"{capture}: points need at least two photographs with poses, these are {len(views)}")
@@ -86,7 +82,7 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
 
 
 def _job(stated: Sequence[str], views: Sequence[Photograph], poses: list[list[list[float]]], work: Path) -> Job:
-    links, masks = emptied(work / "links"), emptied(work / "masks")
+    links, masks = emptied(work / "links"), {}
     groups: dict[ColmapCamera, list[str]] = defaultdict(list)
     names = {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
@@ -99,9 +95,7 @@ def _job(stated: Sequence[str], views: Sequence[Photograph], poses: list[list[li
         groups[view.camera].append(plain)
         names[plain] = name
         if view.mask is not None and os.path.isfile(view.mask):
-            colmap_mask(view.mask, view.camera.size).save(masks / f"{plain}.png")
-    mask_folder = str(masks.resolve()) if any(masks.iterdir()) else None
+            masks[plain] = view.mask, view.camera.size
     cameras = [CameraGroup(camera, True, members) for camera, members in groups.items()]
-    placed = dict(zip(names, poses, strict=True))
-    folders = str(work.resolve()), str(links.resolve()), mask_folder
-    return Job(*folders, cameras, list(names), names, poses=placed)
+    folders = str(work.resolve()), str(links.resolve()), write_colmap_masks(work / "masks", masks)
+    return Job(*folders, cameras, list(names), names, poses=dict(zip(names, poses, strict=True)))

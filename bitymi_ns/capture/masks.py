@@ -1,7 +1,7 @@
 """Masks of photographs, for structure from motion and for training: finding, reading and checking them."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path, PurePath
 
@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from bitymi_ns.capture.cache import emptied
 from bitymi_ns.capture.folder_contents import is_picture, open_picture
 from bitymi_ns.capture.image_files import has_transparency, image_size, in_proportion, in_threads, wrong_size
 from bitymi_ns.capture.kinds import DYNAMIC, MASK, PHOTOGRAPHS
@@ -27,11 +28,10 @@ MIDDLE = 127  # threshold of lossy masks, of 255
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
     """Find the folder of masks: `stated`, else the first `masks` or `mask` beside the folder `photographs`, in it, or
-    in `data`; else that of reduced masks (`masks_2` for a `downscale` of 2).
-
-    If `data` is the folder of photographs, or in it, a `masks` beside it may belong to something else. It is used if
-    the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for `all/bed`. Raises CaptureError:
-    neither the stated one nor its reduced one exists."""
+    in `data`; else that of reduced masks (`masks_2` for a `downscale` of 2). If `data` is the folder of photographs, or
+    in it, a `masks` beside it may belong to something else. It is used if the folder has a usual name: `bed/masks` for
+    `bed/images`, but not `all/masks` for `all/bed`. Raises CaptureError: neither the stated one nor its reduced one
+    exists."""
     shown, named = Path(os.path.abspath(photographs)), Path(os.path.abspath(data))
     folders = [shown, named]
     if shown.name in USUAL_FOLDERS or not named.is_relative_to(shown):
@@ -82,11 +82,8 @@ def _is_dynamic(path: Path) -> bool:
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
     """Threshold a mask to the pixels [H, W] that count: not wholly transparent, and not black, or above MIDDLE for
-    lossy formats.
-
-    As in COLMAP and nerfstudio, masks may hold zeros and ones, or class numbers. JPEG ripples around an edge are a few
-    levels above black, but stay below MIDDLE.
-    """
+    lossy formats. As in COLMAP and nerfstudio, masks may hold zeros and ones, or class numbers. JPEG ripples around an
+    edge are a few levels above black, but stay below MIDDLE."""
     if image.mode.startswith(("I", "F")):
         result = np.asarray(image) != 0
     else:
@@ -115,13 +112,9 @@ def with_masks(
     images: Path | None = None,
 ) -> list[Photograph]:
     """Add masks to photographs, see `find_masks`, and report it. Masks beside photographs may be some. Raises
-    CaptureError: the folder has masks of some photographs only, or of none and is stated or that of a model.
-
-    Args:
-        base: folder of the photographs, whose paths in it name the masks; None = their common folder.
-        stated: folder of masks, relative to the capture; None = see `mask_folder`.
-        images: folder of a model's files, which have the names of those in `base`; None = no model, `base`.
-    """
+    CaptureError: the folder has masks of some photographs only, or of none and is `stated`, relative to the capture, or
+    that of a model. `base`: folder in which the photographs' paths name the masks, None = their common one; `images`:
+    folder of a model's files, which have the names of those in `base`."""
     files = [each.file for each in photographs]
     base = base or Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))
     names = [os.path.normpath(os.path.relpath(file, images or base)) for file in files]
@@ -159,9 +152,13 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
             fail(f"{wrong_size(mask, size, photograph.camera.size)} {LEAVE_OUT[0].upper()}{LEAVE_OUT[1:]}.")
 
 
-def colmap_mask(path: Path, size: tuple[int, int]) -> Image.Image:
-    """Read the mask of an upright photograph of this `size` for COLMAP: grey, of that size."""
-    mask = checked_mask(path)
-    if not in_proportion(mask.size, size):
-        fail(wrong_size(path, mask.size, size))
-    return mask.resize(size, Image.Resampling.NEAREST).convert("L")
+def write_colmap_masks(folder: Path, masks: Mapping[str, tuple[Path, tuple[int, int]]]) -> str | None:
+    """Write the masks of upright photographs, by name and with the photographs' sizes, as COLMAP reads them: grey, of
+    these sizes. Return the folder, emptied before; None = no masks."""
+    emptied(folder)
+    for name, (path, size) in masks.items():
+        mask = checked_mask(path)
+        if not in_proportion(mask.size, size):
+            fail(wrong_size(path, mask.size, size))
+        mask.resize(size, Image.Resampling.NEAREST).convert("L").save(folder / f"{name}.png")
+    return str(folder.resolve()) if masks else None

@@ -18,7 +18,7 @@ from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.folder_contents import passed_over, photo_folder, refusal, unreadable_in, videos_in
 from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.kinds import FILM, VIDEOS
-from bitymi_ns.capture.masks import colmap_mask, find_masks, mask_folder
+from bitymi_ns.capture.masks import find_masks, mask_folder, write_colmap_masks
 from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
@@ -38,24 +38,25 @@ SPARSE = Path("sparse/0")  # the model's path in a result
 
 
 def find_poses(
-    source: Path, options: SfmOptions | None = None, progress: Progress | None = None, warn: Tell = warnings.warn
+    source: Path,
+    options: SfmOptions | None = None,
+    progress: Progress | None = None,
+    warn: Tell = warnings.warn,
+    capture: Path | None = None,
 ) -> FoundPoses:
-    """Find camera poses of photographs or of a video's frames; cache them beside the photographs, or in the user's
-    cache folder if nothing can be written there; continue an interrupted run. Raises CaptureError: no poses can be
-    found; says what to photograph differently; KeyboardInterrupt: Ctrl-C; what is done is kept.
-
-    Args:
-        source: a folder of photographs, a folder with `images` (and `masks`), or a video.
-        warn: called with what is left out, and the location of the result if not beside writable photographs.
-    """
+    """Find camera poses of photographs (of a folder, or its `images`) or of a video's frames; cache them beside the
+    photographs, or in the user's cache folder if nothing can be written there; continue an interrupted run. `warn` is
+    told what is left out; `capture`: folder that may hold the masks, too. Raises CaptureError: no poses can be found;
+    says what to photograph differently; KeyboardInterrupt: Ctrl-C; what is done is kept."""
     options = options or SfmOptions()
     tell = progress or no_progress
     source, folder, names = _photographs_in(Path(source))
     sfm_photos.check_names(folder, names)
     masks: dict[str, Path] = {}
     if options.use_masks and names:
-        where = mask_folder(folder, source, options.masks)
-        if where is not None and (below := where / folder.relative_to(photo_folder(source))).is_dir():
+        base, within = photo_folder(source), capture or source
+        where = mask_folder(base, within, options.masks) or mask_folder(folder, within)
+        if where is not None and (below := where / folder.relative_to(base)).is_dir():
             where = below
         masks, _ = find_masks(names, folder, where, options.masks is not None)
         if not masks and where is not None:
@@ -222,19 +223,16 @@ def make_job(
     """Make the job of these photographs in their order, linked in the work folder under names without spaces for
     COLMAP's lists. `images`: folder of the upright photographs, `used` their names in it; neighbours overlap in a
     `sequence`."""
-    links, mask_files = emptied(work / "links"), emptied(work / "masks")
+    links = emptied(work / "links")
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:
         (links / plain[photo.name]).symlink_to((images / used[photo.name]).resolve())
-    for photo in photos:
-        if photo.name in masks:
-            mask = colmap_mask(masks[photo.name], (photo.width, photo.height))
-            mask.save(mask_files / f"{plain[photo.name]}.png")
+    masked = {plain[p.name]: (masks[p.name], (p.width, p.height)) for p in photos if p.name in masks}
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
     cameras = [camera_group(members, [plain[p.name] for p in members], options) for members in by_camera(photos)]
-    mask_folder = str(mask_files.resolve()) if masks else None
+    folders = str(work.resolve()), str(links.resolve()), write_colmap_masks(work / "masks", masked)
     return Job(
-        *(str(work.resolve()), str(links.resolve()), mask_folder, cameras, list(plain.values())),
+        *(*folders, cameras, list(plain.values())),
         names={plain[photo.name]: used[photo.name] for photo in photos},
         sequence=sequence,
         positions={plain[name]: position for name, position in positions.items()},

@@ -11,12 +11,9 @@ from typing import Any
 
 from bitymi_ns.capture.cache import keep_work_folder
 from bitymi_ns.capture.colmap_views import Origin, Source
-from bitymi_ns.capture.folder_contents import photo_folder
 from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
-from bitymi_ns.capture.masks import find_masks, mask_folder
 from bitymi_ns.capture.recognise import Found
-from bitymi_ns.capture.sfm_photos import find_photos
 from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
 from bitymi_ns.safe_reading import read_json
@@ -48,14 +45,10 @@ def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings
     from bitymi_ns.capture.poses import find_poses  # slow to import
     from bitymi_ns.progress import rich_progress
 
-    masks = None
-    if use_masks and found.format != "video":
-        base, stated = photo_folder(found.path), None if masks_path is None else found.folder / masks_path
-        beside = stated is None and find_masks(find_photos(base), base, None)[0]
-        masks = None if beside else mask_folder(base, found.folder, stated)
+    masks = None if masks_path is None else found.folder / masks_path
     with rich_progress() as progress:
         options = SfmOptions(**asdict(settings), masks=masks, use_masks=use_masks)
-        poses = find_poses(found.path, options, progress, warn)
+        poses = find_poses(found.path, options, progress, warn, found.folder)
     keep_work_folder(poses.report.parent)
     say(
         f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "

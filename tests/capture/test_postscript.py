@@ -7,7 +7,7 @@ import pytest
 from PIL import EpsImagePlugin, Image
 
 from bitymi_ns.capture.image_files import file_has_transparency, read_image, set_up_pillow
-from bitymi_ns.capture.masks import checked_mask, colmap_mask
+from bitymi_ns.capture.masks import checked_mask, write_colmap_masks
 from bitymi_ns.capture.sfm_photos import read_photo
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.measure.report.pictures import open_image
@@ -34,7 +34,7 @@ def disguised(tmp_path: Path) -> Path:
 
 READERS: dict[str, Callable[[Path], object]] = {
     "photograph": lambda path: read_photo(path.parent, path.name),
-    "mask of a photograph": lambda path: colmap_mask(path, (64, 48)),
+    "mask of a photograph": lambda path: write_colmap_masks(path.parent / "masks", {"a": (path, (64, 48))}),
     "image": read_image,
     "mask": checked_mask,
     "picture of a report": open_image,

@@ -31,14 +31,15 @@ def test_poses_are_found_with_the_masks_of_the_training(
 ) -> None:
     asked: list[Any] = []
 
-    def find_poses(source: Path, options: Any, *told: Any) -> None:
-        asked.append(options.masks)
+    def find_masks(names: Any, base: Path, folder: Path | None, stated: bool) -> None:
+        asked.append(folder)
         raise CaptureError("not now")
 
-    monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", find_poses)
+    monkeypatch.setattr("bitymi_ns.capture.poses.find_masks", find_masks)
     for folder in (photographs, "bed/masks", "bed/mine", "bed/all/masks"):
         (tmp_path / folder).mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", (8, 6)).save(tmp_path / photographs / "a.png")
+    for name in "abc":
+        Image.new("RGB", (8, 6)).save(tmp_path / photographs / f"{name}.png")
     found = recognise(tmp_path / data, "photographs")
     with pytest.raises(CaptureError, match="not now"):
         sfm_poses.find_sfm_source(found, given, SfmSettings())

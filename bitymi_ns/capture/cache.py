@@ -98,11 +98,8 @@ def replace_stale(work: Path, photographs: Path, contents: str) -> None:
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
         if other != work and is_own(other) and _is_stale(other, source, contents):
-            try:
-                with locks.Lock(other / ".lock", tell=lambda text: None):
-                    shutil.rmtree(other, ignore_errors=True)
-            except (locks.Busy, OSError):
-                continue
+            with suppress(OSError), locks.Lock(other / ".lock", tell=lambda text: None):
+                shutil.rmtree(other, ignore_errors=True)
 
 
 def _is_stale(other: Path, source: str, contents: str) -> bool:
@@ -110,19 +107,16 @@ def _is_stale(other: Path, source: str, contents: str) -> bool:
         of = read_json(other / OF)
         if of["source"] != source or of["contents"] == contents:
             return False
-    except (OSError, ValueError, LookupError, TypeError):
-        return False
-    for mark in other.glob(f"{IN_USE}*"):
-        try:
+        for mark in other.glob(f"{IN_USE}*"):
             locks.Lock(mark, tell=lambda text: None).release()
-        except (locks.Busy, OSError):
-            return False
+    except (OSError, ValueError, LookupError, TypeError):  # also a process that uses it
+        return False
     return True
 
 
 def keep_work_folder(work: Path) -> None:
     """Keep other processes from removing a work folder while this one runs."""
-    with suppress(locks.Busy, OSError):  # a read-only folder is not removed either
+    with suppress(OSError):  # a read-only folder is not removed either
         mark = work / f"{IN_USE}{os.getpid()}"
         locks.hold(mark, lambda text: None)
         atexit.register(locks.release, mark)

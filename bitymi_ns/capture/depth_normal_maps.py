@@ -31,9 +31,8 @@ FARTHEST = 65504.0  # depth from which on numbers mean "no depth": the largest h
 Check = Callable[[tuple[int, ...]], None]
 """Receives a header's shape, and raises if it must not be read."""
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-(getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(
-    0
-)  # a damaged map gets one message, without OpenCV's
+# a damaged map gets one message, without OpenCV's
+(getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)
 _PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
 
 Values = npt.NDArray[np.float32]
@@ -78,11 +77,10 @@ def _channels_differ(values: npt.NDArray[np.generic]) -> bool:
 
 
 def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values:
-    """Read camera z [H, W] for the pinhole picture of a lens, by nearest neighbors; 0 = unknown.
-
-    Integers are millimetres, 0 and the largest one unknown. Floating-point numbers are metres; unknown unless finite,
-    above 0 and below 65,504. A confidence of 0 means unknown. `unit` overrides the metres per unit. Raises
-    CaptureError: a file cannot be read, or has another shape than the photograph."""
+    """Read camera z [H, W] for the pinhole picture of a lens, by nearest neighbors; 0 = unknown. Integers are
+    millimetres, 0 and the largest one unknown. Floating-point numbers are metres; unknown unless finite, above 0 and
+    below 65,504. A confidence of 0 means unknown. `unit` overrides the metres per unit. Raises CaptureError: a file
+    cannot be read, or has another shape than the photograph."""
     assert files.depth is not None
     stored = _read(files.depth, lens.stored)
     if stored.ndim != 2:
@@ -98,11 +96,9 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
 
 
 def read_normal(files: MapFiles, lens: Lens) -> Values:
-    """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown.
-
-    Files hold them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers, or colors (n
-    + 1) / 2 with black for unknown. Raises CaptureError: a file cannot be read, or has another shape than the
-    photograph."""
+    """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown. Files hold
+    them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers, or colors (n + 1) / 2
+    with black for unknown. Raises CaptureError: a file cannot be read, or has another shape than the photograph."""
     assert files.normal is not None
     stored = _read(files.normal, lens.stored)
     if stored.ndim != 3 or stored.shape[2] < 3:
@@ -193,15 +189,11 @@ def _array(file: IO[bytes], check: Check) -> npt.NDArray[np.generic]:
     if dtype.kind not in "iuf":
         raise ValueError(f"it holds no numbers, but {dtype}")
     check(shape)
-    values = np.frombuffer(_whole(file, int(np.prod(shape, dtype=object)) * dtype.itemsize), dtype)
-    return values.reshape(shape, order="F" if by_columns else "C")
-
-
-def _whole(file: IO[bytes], count: int) -> bytes:
+    count = math.prod(shape) * dtype.itemsize
     data = file.read(count)
     if len(data) < count:
         raise ValueError(f"it is cut off: it has {len(data)} of {count} bytes")
-    return data
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if by_columns else "C")
 
 
 def image_shape(path: Path) -> tuple[int, int]:

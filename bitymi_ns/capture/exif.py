@@ -141,11 +141,8 @@ def _up(
 
 def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
     """Parse AccelerationVector (tag 8) of Apple's maker note, in g. Its axes point to the phone's left side as seen
-    from its front, to its bottom, and into its face. For a phone held still it points away from the ground.
-
-    The note has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its
-    start.
-    """
+    from its front, to its bottom, and into its face. For a phone held still it points away from the ground. The note
+    has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its start."""
     if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
         return None
     try:

@@ -35,11 +35,9 @@ def without_extension(parts: Parts) -> Parts:
 
 @dataclass
 class FileFinder:
-    """Finder of files below a folder by names that machines and programs may have changed, if only one file fits.
-
-    Names are compared exactly first; then with other separators, case, Unicode form or leading folders, as of absolute
-    names; then with another extension, or none.
-    """
+    """Finder of files below a folder by names that machines and programs may have changed, if only one file fits. Names
+    are compared exactly first; then with other separators, case, Unicode form or leading folders, as of absolute names;
+    then with another extension, or none."""
 
     folder: Path  # to which names are relative
     outside: bool = False  # allow names that lead out of it
@@ -156,9 +154,8 @@ def _hint(folder: Path, file: Path, named: Sequence[Path]) -> str:
         return " (a link to nothing)"
     if os.path.exists(file):
         return " (not a file)"
-    near = FileFinder(file.parent if os.path.isdir(file.parent) else folder).nearest(
-        file.name, [each.name for each in named]
-    )
+    finder = FileFinder(file.parent if os.path.isdir(file.parent) else folder)
+    near = finder.nearest(file.name, [each.name for each in named])
     return f" ({near})" if near else ""
 
 

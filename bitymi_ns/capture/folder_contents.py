@@ -129,11 +129,6 @@ def photographs_below(folder: Path) -> Iterator[Path]:
     return (path for path, kind in look_in(folder) if kind is None)
 
 
-def has_photographs(folder: Path) -> bool:
-    """Test for photographs in or below a folder."""
-    return any(True for _ in photographs_below(folder))
-
-
 def folders_in(folder: Path) -> list[Path]:
     """List the subfolders that may hold photographs."""
     names = [path.name for path in folder.iterdir() if path.is_dir()]

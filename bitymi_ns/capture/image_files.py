@@ -73,11 +73,9 @@ def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
 
 
 def exposure_stops(paths: Sequence[Path]) -> list[float]:
-    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown.
-
-    An entry that most photographs lack (f-number of manual lenses, ISO of some cameras) counts as equal for all.
-    Photographs with other entries than most are NaN.
-    """
+    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown. An entry
+    that most photographs lack (f-number of manual lenses, ISO of some cameras) counts as equal for all. Photographs
+    with other entries than most are NaN."""
     found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
     kinds = [None if each is None else tuple(value is not None for value in each) for each in found]
     usual = Counter(kind for kind in kinds if kind is not None).most_common(1)
@@ -88,14 +86,10 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
-    """Read a photograph as 8-bit sRGB, mode RGB, or RGBA with transparency. Grey of more than 8 bits, which PIL would
-    clip to white, is scaled to 8 bits. Raises CaptureError: it is missing, cannot be read, or has another size.
-
-    Args:
-        stored: width and height that it must have; None = any.
-        wanted: width and height to which it is downscaled, averaging over pixels. A JPEG is decoded at a half, a
-            quarter or an eighth of its size if that is at least twice as large, to average over 2 x 2 or more.
-    """
+    """Read a photograph of `stored` width and height (None = any) as 8-bit sRGB, mode RGB, or RGBA with transparency,
+    downscaled to those `wanted` by averages over pixels: a JPEG is decoded at a half, a quarter or an eighth of its
+    size if that is at least twice as large. Grey of more than 8 bits, which PIL would clip to white, is scaled to 8.
+    Raises CaptureError: it is missing, cannot be read, or has another size."""
     try:
         with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:

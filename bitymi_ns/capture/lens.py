@@ -251,9 +251,7 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int]) -> list[Lens]:
 
 def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
     """Measure how far the pinhole picture extends to the left, right, top and bottom of the axis, in focal lengths.
-
-    Maximize each side alone, then scale all until the photograph covers the corners, too.
-    """
+    Maximize each side alone, then scale all until the photograph covers the corners, too."""
     most = math.tan(math.radians(0.5 * MAX_VIEW_ANGLE))
     reach = np.zeros(4)
 
@@ -325,15 +323,9 @@ def _field(camera: ColmapCamera) -> float:
 
 
 def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
-    """Convert nerfstudio's camera type, see `transforms.CAMERA_TYPES`, and its distortion_params to COLMAP's. Raises
-    CaptureError: COLMAP has no such camera, or `values` are too many or too few.
-
-    Args:
-        values: k1, k2, k3, k4, p1, p2; twelve of FISHEYE624.
-
-    Returns:
-        camera model with separate focal lengths, and its parameters after fx, fy, cx, cy (none if SPHERICAL_MODEL).
-    """
+    """Convert nerfstudio's camera type, see `transforms.CAMERA_TYPES`, and its distortion_params (k1, k2, k3, k4, p1,
+    p2; twelve of FISHEYE624) to COLMAP's model with separate focal lengths and its parameters after fx, fy, cx, cy;
+    none if SPHERICAL_MODEL. Raises CaptureError: COLMAP has no such camera, or `values` are too many or too few."""
     if kind == "EQUIRECTANGULAR":
         return SPHERICAL_MODEL, ()
     if kind not in ("PERSPECTIVE", "FISHEYE", "FISHEYE624"):

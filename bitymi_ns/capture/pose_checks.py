@@ -24,11 +24,10 @@ format's unit."""
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
-    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; valid ones stay equal.
-
-    Divide out each matrix's common factor, and undo rounding by the nearest rotation. Mirrored rotations (determinant
-    -1) stay mirrored, as whole captures may be. `names` of the frames and `source` are for messages. Raises
-    CaptureError: a matrix is not finite, zero or sheared."""
+    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; valid ones stay equal. Divide out
+    each matrix's common factor, and undo rounding by the nearest rotation. Mirrored rotations (determinant -1) stay
+    mirrored, as whole captures may be. `names` of the frames and `source` are for messages. Raises CaptureError: a
+    matrix is not finite, zero or sheared."""
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
     largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares of the numbers may overflow
@@ -170,11 +169,8 @@ def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
     """Warn if points [N, 3] seem to be in another unit than finite camera positions [M, 3]; `widths` [M] of the
-    pictures in focal lengths.
-
-    Such points are far beyond the cameras or a spot of the pictures, and training starts from next to nothing. Medians
-    and percentiles are robust to outliers.
-    """
+    pictures in focal lengths. Such points are far beyond the cameras or a spot of the pictures, and training starts
+    from next to nothing. Medians and percentiles are robust to outliers."""
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]
     if len(points) == 0:

@@ -143,13 +143,9 @@ class Capture:
 
 
 def read_capture(options: CaptureOptions, need_photos: bool = True, want_points: bool = True) -> Capture:
-    """Read a capture of any format, and check all that its files state. Raises CaptureError: it cannot be used; names
-    the file and the entry, and says what to do.
-
-    Args:
-        need_photos: fail if photographs are missing; else their files are not opened.
-        want_points: a scene starts from the points: color them, and triangulate missing ones.
-    """
+    """Read a capture of any format, and check all that its files state. `need_photos`: fail if photographs are missing,
+    else their files are not opened; `want_points`: color the points, and triangulate missing ones. Raises CaptureError:
+    it cannot be used; names the file and the entry, and says what to do."""
     try:
         return _Reader(options, options.find(), need_photos, want_points).read()
     except OSError as error:
@@ -206,7 +202,6 @@ class _Reader:
         return downscaled(photographs, folder, self.downscale) if self.downscale > 1 else photographs
 
     def _transforms(self) -> Capture:
-        """Read a transforms.json."""
         options, found = self.options, self.found
         read, source = self._read_transforms(found.path), str(found.path)
         meta, frame = read.meta, options
@@ -261,7 +256,6 @@ class _Reader:
         )  # fmt: skip
 
     def _scanned(self) -> Capture:
-        """Read the capture of a scanning program."""
         found = self.found
         photographs, source = scanner_photographs(found), str(found.path)
         photographs = self._prepared(photographs, found.folder)
@@ -333,8 +327,7 @@ class _Reader:
 
     def _placed(self, points: Points) -> Points:
         """Mirror points of files as the poses are."""
-        mirrored = points._replace(xyz=points.xyz @ self.mirror[:3, :3].T + self.mirror[:3, 3])
-        return mirrored if (self.mirror != np.eye(4)).any() else points
+        return points._replace(xyz=points.xyz @ self.mirror[:3, :3].T + self.mirror[:3, 3])
 
     def _points(self, own: Points | None, photographs: Sequence[Photograph], source: str) -> Points | None:
         """Choose the points to start from: of --ply-path, the capture's `own`, those of a PLY file beside it that shows

@@ -262,12 +262,10 @@ _decided: dict[str, Decision] = {}  # commands read a capture twice: to check it
 def as_meant(
     photographs: Sequence[Photograph], written: Reading, frame: Array, source: str, asked: str
 ) -> tuple[list[Photograph], Array, str]:
-    """Give photographs the poses and intrinsics of the reading `asked` for (AUTO = the photographs decide), and say so.
-    `frame`: transform [4, 4] from the world of the files to that of the photographs.
-
-    Returns the photographs, the reflection [4, 4] of their world (the identity unless it was left-handed), and the
-    reading's name. Raises CaptureError: the format has no such reading.
-    """
+    """Give photographs the poses and intrinsics of the reading `asked` for (AUTO = the photographs decide), and say so;
+    return them, the reflection [4, 4] of their world (the identity unless it was left-handed), and the reading's name.
+    `frame`: transform [4, 4] from the world of the files to that of the photographs. Raises CaptureError: the format
+    has no such reading."""
     named = {WRITTEN: written} | {each.name: each for each in readings(written)}
     poses, decision = np.linalg.inv(frame) @ np.stack([each.pose for each in photographs]), Decision(named.get(asked))
     if asked == AUTO:

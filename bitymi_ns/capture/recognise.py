@@ -56,13 +56,9 @@ class Found:
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
-    """Recognize the capture at a path. Raises CaptureError: there is none of that format.
-
-    Args:
-        data: a folder, or a file: transforms.json, a video, or a file of a COLMAP model.
-        format: to search for; auto = any, files with poses before photographs without.
-        colmap_path: folder of a COLMAP model, relative to the capture.
-    """
+    """Recognize the capture of a `format` (auto = any, files with poses before photographs without) at a path: a
+    folder, transforms.json, a video, or a file of a COLMAP model. `colmap_path`: folder of a COLMAP model, relative to
+    the capture. Raises CaptureError: there is none of that format."""
     if not data.exists():
         fail(f"the capture {data} does not exist. Give a folder or a file with --data.")
     if colmap_path is not None:
@@ -149,10 +145,8 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
     if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
         yield "polycam", folder
-    for name in ("metadata", "metadata.json"):
-        if folder_contents.holds(folder / name, b'"poses"', MOST_TEXT):
-            yield "record3d", folder
-            break
+    if any(folder_contents.holds(folder / name, b'"poses"', MOST_TEXT) for name in ("metadata", "metadata.json")):
+        yield "record3d", folder
     first = min(folder.glob("frame_*.json"), default=None)
     if first is not None and folder_contents.holds(first, b'"cameraPoseARFrame"', MOST_TEXT):
         yield "3d-scanner", folder
@@ -217,9 +211,9 @@ def image_count(model: Path) -> int:
 def _photographs_in(folder: Path) -> Path | None:
     """Choose the folder to search for photographs: this one if it or its `images` holds some, or several subfolders do;
     else the same within the only subfolder that does. None = no photographs, or subfolders that are captures."""
-    if folder_contents.photographs_in(folder) or folder_contents.has_photographs(folder / "images"):
+    if folder_contents.photographs_in(folder) or any(folder_contents.photographs_below(folder / "images")):
         return folder
-    holding = list(filter(folder_contents.has_photographs, folder_contents.folders_in(folder)))
+    holding = [path for path in folder_contents.folders_in(folder) if any(folder_contents.photographs_below(path))]
     if not holding or captures_in(folder):
         return None
     return _photographs_in(holding[0]) if len(holding) == 1 else folder
@@ -228,7 +222,7 @@ def _photographs_in(folder: Path) -> Path | None:
 def captures_in(folder: Path) -> list[Path]:
     """List the subfolders whose `images` hold photographs, as captures of their own; empty if there is only one."""
     folders = folder_contents.folders_in(folder)
-    found = [path for path in folders if folder_contents.has_photographs(path / "images")]
+    found = [path for path in folders if any(folder_contents.photographs_below(path / "images"))]
     return found if len(found) > 1 else []
 
 
@@ -245,7 +239,6 @@ def _colmap_given(data: Path, colmap_path: Path) -> Found:
 
 
 def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> str:
-    """Explain why a path is no capture."""
     if format != "auto":
         held = ", ".join(f"{_seen_from(path, data)} ({found})" for found, path in candidates[:3])
         there = f" It holds {held}: leave --format out." if candidates else ""

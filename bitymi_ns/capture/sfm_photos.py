@@ -96,8 +96,7 @@ def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[lis
                 except CaptureError as error:
                     broken[name] = str(error)
         finally:
-            for result in pending:
-                result.cancel()
+            pool.shutdown(cancel_futures=True)
     progress("reading photographs", len(names), len(names))
     return photos, broken
 
@@ -165,9 +164,7 @@ def is_plain(image: Image.Image, path: Path) -> bool:
 
 
 def _reduced(image: Image.Image, size: int) -> Image.Image:
-    scale = size / max(image.size)
-    if scale >= 1:
-        return image
+    scale = min(1.0, size / max(image.size))
     return image.resize((max(1, round(image.width * scale)), max(1, round(image.height * scale))), Image.BOX)
 
 

@@ -166,10 +166,8 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
             fail(f"{path}: frame {i} (counted from 0) has no {' and no '.join(lacking)}. Add that or remove the frame.")
         for key in FILE_KEYS:
             name = frame.get(key, "none")
-            if not isinstance(name, str) or find_files.folded(name)[-1:] in (
-                (),
-                ("..",),
-            ):  # of the folder itself or above
+            last = find_files.folded(name)[-1:] if isinstance(name, str) else ()
+            if last in ((), ("..",)):  # of the folder itself or above
                 fail(f"{path}: the {key} of frame {i} is {name!r}, not the name of a file")
             if key in frame and os.sep == "/" and not os.path.exists(path.parent / name):
                 frame[key] = name.replace("\\", "/")
@@ -208,7 +206,6 @@ def _check_applied(path: Path, meta: dict[str, Any]) -> None:
 
 
 def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ColmapCamera:
-    """Convert the camera of a frame to COLMAP's."""
     name = frame["file_path"]
 
     def value(*keys: str) -> tuple[str, float] | None:

@@ -12,7 +12,6 @@ from scipy.sparse.csgraph import connected_components
 
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm.job import MAX_ERROR, CameraGroup, Job, NoPoses
-from bitymi_ns.capture.types import SPHERICAL_MODEL
 
 LINK = 15  # points seen together that link two photographs; COLMAP's least number of inliers of a pair
 FEW_FEATURES = 60  # features of a photograph with hardly any detail
@@ -147,12 +146,14 @@ def only_turned(job: Job, database: Path) -> bool:
 def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndarray, float]:
     """Make unit rays [n,3] of points [n,2] in pixels, and pixels per radian; `guess` of an unknown focal length, in
     longer sides."""
-    camera = group.camera
-    if camera.model == SPHERICAL_MODEL:
-        return camera.colmap.cam_ray_from_img(points.astype(float)), camera.width / (2.0 * np.pi)
-    focal = camera.params[0] if group.prior else guess * max(camera.size)
-    rays = np.column_stack([(points - np.array(camera.size) / 2) / focal, np.ones(len(points))])
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True), focal
+    camera, side = group.camera.colmap, max(group.camera.size)
+    if not (group.prior or camera.is_spherical()):
+        camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_PINHOLE", guess * side, *group.camera.size)
+    return camera.cam_ray_from_img(points.astype(np.float64)), _pixels_per_radian(camera)
+
+
+def _pixels_per_radian(camera: pycolmap.Camera) -> float:
+    return camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
 
 
 def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
@@ -167,10 +168,8 @@ def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Remove the poses of cameras that too few points link to the largest group: they are arbitrary.
-
-    Mappers register such cameras by directions between pairs, whose points the filters may have removed.
-    """
+    """Remove the poses of cameras that too few points link to the largest group: they are arbitrary. Mappers register
+    such cameras by directions between pairs, whose points the filters may have removed."""
     placed = [image for image in model.images.values() if image.has_pose]
     column = {image.image_id: i for i, image in enumerate(placed)}
     tracks = [sorted({column[e.image_id] for e in p.track.elements}) for p in model.points3D.values()]
@@ -199,9 +198,7 @@ def contradicted(model: pycolmap.Reconstruction, database: Path, pixel: float) -
             matches = np.asarray(geometry.inlier_matches)
             if first not in placed or second not in placed or len(matches) < LINK:
                 continue
-            camera = placed[second].camera
-            focal = camera.width / (2.0 * np.pi) if camera.is_spherical() else camera.mean_focal_length()
-            limit = MAX_ERROR * pixel / focal  # angle in the middle of the picture
+            limit = MAX_ERROR * pixel / _pixels_per_radian(placed[second].camera)  # angle in the picture's middle
             a, b = (rays[i][column] for i, column in zip((first, second), matches.T, strict=True))
             move = placed[second].cam_from_world() * placed[first].cam_from_world().inverse()
             total += len(matches)

@@ -8,7 +8,7 @@ import sqlite3
 import subprocess
 import threading
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 from bitymi_ns.capture.sfm.job import DATABASE, PAIRS, Job
@@ -58,11 +58,8 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
 
 @contextmanager
 def _watched(database: Path, table: str, progress: Progress, stage: str, total: int) -> Iterator[None]:
-    """Report the rows of a table of COLMAP's database while COLMAP fills it.
-
-    Rows are counted in this process: COLMAP's copy of SQLite and Python's in one process would release each other's
-    file locks.
-    """
+    """Report the rows of a table of COLMAP's database while COLMAP fills it. Rows are counted in this process: COLMAP's
+    copy of SQLite and Python's in one process would release each other's file locks."""
     ended = threading.Event()
 
     def watch() -> None:
@@ -80,14 +77,10 @@ def _watched(database: Path, table: str, progress: Progress, stage: str, total: 
 
 def rows(database: Path, table: str) -> int:
     """Count the rows of a table; 0 if it cannot be read. Not in a process in which COLMAP has the database open."""
-    try:
-        connection = sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True, timeout=5)
-        try:
-            return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
-        finally:
-            connection.close()
-    except sqlite3.Error:
-        return 0
+    where = f"{database.absolute().as_uri()}?mode=ro"
+    with suppress(sqlite3.Error), closing(sqlite3.connect(where, uri=True, timeout=5)) as connection:
+        return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+    return 0
 
 
 def delete_work(work: Path, *folders: str) -> None:

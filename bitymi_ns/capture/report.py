@@ -40,6 +40,10 @@ def overview(values: Mapping[str, Any]) -> dict[str, str]:
     def text(key: str, form: str) -> str:
         return form.format(numbers[key]) if key in numbers else "–"
 
+    metres = "metres_per_unit" in numbers
+    up = values.get("up") or ("gps" if metres else "cameras")  # earlier reports state none
+    world = {"gps": "z up by GPS", "gravity": "z up by gravity"}.get(str(up), "z up by the cameras")
+    error = f" (median error {numbers['gps_error']:.1f} m)" if "gps_error" in numbers else ""
     return {
         "Photographs with a pose": f"{text('registered', '{:,}')} of {text('given', '{:,}')}",
         "Mean reprojection error, pixels": text("reprojection_error", "{:.3f}"),
@@ -47,7 +51,7 @@ def overview(values: Mapping[str, Any]) -> dict[str, str]:
         "Points": text("points", "{:,}"),
         "Median parallax, degrees": text("parallax_degrees", "{:.1f}"),
         "Matches that contradict the poses": text("contradicted", "{:.1%}"),
-        "Up, scale": _frame_text(values.get("up"), numbers),
+        "Up, scale": f"{world}, metres by GPS{error}" if metres else f"{world}, scale not known",
         "Seconds": ", ".join(seconds),
     }
 
@@ -76,16 +80,6 @@ def _table(header: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 def _cell(text: object) -> str:
     return printable(str(text)).replace("|", "\\|").replace("\n", " ")
-
-
-def _frame_text(up: object, numbers: Mapping[str, float]) -> str:
-    """Describe the sources of up and scale, by `up`, `metres_per_unit` and `gps_error`."""
-    metres, error = "metres_per_unit" in numbers, numbers.get("gps_error")
-    up = up or ("gps" if metres else "cameras")  # earlier reports state none
-    text = {"gps": "z up by GPS", "gravity": "z up by gravity"}.get(str(up), "z up by the cameras")
-    if not metres:
-        return f"{text}, scale not known"
-    return f"{text}, metres by GPS{'' if error is None else f' (median error {error:.1f} m)'}"
 
 
 def _draw(path: Path, model: pycolmap.Reconstruction, metres: bool) -> None:

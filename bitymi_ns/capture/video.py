@@ -33,7 +33,7 @@ TRUSTED = {
 LEAST_SURVEYED = 60  # least number of surveyed frames: all of a clip of a second or two
 NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene, with it in view"
 PQ, HLG = 16, 18  # transfer functions of high dynamic range, as ITU-T H.273 numbers them
-FULL_RANGE = 2
+BT2020 = 9  # matrix of luma and chroma of such films
 WHITE = 203.0  # cd/m^2 of white paper in such films (ITU-R BT.2408), which becomes a screen's white
 HLG_PEAK, HLG_GAMMA = 1000.0, 1.2  # peak luminance and gamma of HLG's reference display (ITU-R BT.2100)
 KNEE = 0.8  # share of white up to which light is kept; brighter light is compressed to white
@@ -94,8 +94,7 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
 
 
 def choose(motion: np.ndarray, sharp: np.ndarray, count: int) -> list[int]:
-    """Choose the sharpest frame of each of `count` stretches of equal motion, by motion from the start [n] and
-    sharpness [n]."""
+    """Choose the sharpest frame of each of `count` stretches of equal motion, by motion from the start [n]."""
     stretch = np.minimum((motion / motion[-1] * count).astype(int), count - 1)
     return [int(i) for s in np.unique(stretch) for i in [np.flatnonzero(stretch == s)[sharp[stretch == s].argmax()]]]
 
@@ -175,9 +174,8 @@ def _opened(video: Path) -> av.container.InputContainer:
         open_regular(video).close()
         container = av.open(os.path.abspath(video), options=TRUSTED)  # a relative path may begin like a URL
     except (av.FFmpegError, OSError, ValueError) as error:
-        raise CaptureError(
-            f"{video} cannot be read as a video ({error.strerror or error}): record or export it again"
-        ) from error
+        reason = error.strerror or error
+        raise CaptureError(f"{video} cannot be read as a video ({reason}): record or export it again") from error
     if not container.streams.video:
         container.close()
         raise CaptureError(f"{video} holds no pictures, only sound: name another file")
@@ -203,8 +201,7 @@ def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame]]:
 
 
 def _decoded(video: Path, threads: str, last: int) -> Generator[tuple[int, av.VideoFrame], None, tuple[str, int, bool]]:
-    """Yield the frames behind number `last`; return a line on damage ("" = none), the last number, and whether frames
-    are missing."""
+    """Yield the frames behind number `last`; return a line on damage ("" = none), the last number, and if some lack."""
     with _opened(video) as container:
         stream = _pictures(container)
         stream.thread_type = threads
@@ -255,7 +252,8 @@ def _picture(frame: av.VideoFrame, shape: float = 1.0) -> Image.Image:
 
 def tone_mapped(frame: av.VideoFrame) -> Image.Image:
     """Convert a high dynamic range frame to 8-bit sRGB, without which it is pale."""
-    signal = _signal(frame)
+    frame.colorspace = BT2020  # some cameras do not state it
+    signal = frame.to_ndarray(format="rgb48le").astype(np.float32) / 65535.0
     nits = pq_to_nits(signal) if frame.color_trc == PQ else hlg_to_nits(signal)
     light = nits @ TO_709.T / WHITE
     brightest = np.maximum(light.max(-1, keepdims=True), 1e-6)
@@ -279,20 +277,3 @@ def hlg_to_nits(signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     scene = np.where(signal <= 0.5, signal**2 / 3.0, (np.exp((signal - c) / a) + b) / 12.0)
     luminance = np.maximum(scene @ LUMA, 1e-6)[..., None]
     return HLG_PEAK * luminance ** (HLG_GAMMA - 1.0) * scene
-
-
-def _signal(frame: av.VideoFrame) -> npt.NDArray[np.float32]:
-    """Decode the non-linear RGB signal [h, w, 3] in [0, 1]."""
-    whole = frame.reformat(format="yuv444p16le")
-    planes = []
-    for plane in whole.planes:
-        rows = np.frombuffer(plane, np.uint16).reshape(plane.height, plane.line_size // 2)
-        planes.append(rows[:, : plane.width].astype(np.float32) / 65536.0)
-    if frame.color_range == FULL_RANGE:
-        y, cb, cr = planes[0], planes[1] - 0.5, planes[2] - 0.5
-    else:
-        y, cb, cr = ((p - low / 256.0) * 256.0 / span for p, low, span in
-                     zip(planes, (16, 128, 128), (219, 224, 224), strict=True))  # fmt: skip
-    red, blue = y + 2.0 * (1.0 - LUMA[0]) * cr, y + 2.0 * (1.0 - LUMA[2]) * cb
-    green = (y - LUMA[0] * red - LUMA[2] * blue) / LUMA[1]
-    return np.clip(np.stack([red, green, blue], -1), 0.0, 1.0).astype(np.float32)

@@ -144,8 +144,7 @@ def only_turned(job: Job, database: Path) -> bool:
 
 
 def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndarray, float]:
-    """Make unit rays [n,3] of points [n,2] in pixels, and pixels per radian; `guess` of an unknown focal length, in
-    longer sides."""
+    """Make unit rays [n,3] of pixels [n,2], and pixels per radian; `guess`: unknown focal length in longer sides."""
     camera, side = group.camera.colmap, max(group.camera.size)
     if not (group.prior or camera.is_spherical()):
         camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_PINHOLE", guess * side, *group.camera.size)

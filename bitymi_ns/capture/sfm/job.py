@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from bitymi_ns.capture.cache import emptied
 from bitymi_ns.capture.types import ColmapCamera
 
 DATABASE = "database.db"
@@ -71,9 +72,7 @@ class Job:
     @contextmanager
     def scratch(self) -> Iterator[Path]:
         """Make an empty folder in the work folder, and remove it afterwards."""
-        folder = Path(self.work) / "scratch"
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir()
+        folder = emptied(Path(self.work) / "scratch")
         try:
             yield folder
         finally:

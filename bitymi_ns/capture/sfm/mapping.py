@@ -67,15 +67,13 @@ def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> py
 def _global(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict[int, pycolmap.Reconstruction]:
     stage = "placing all cameras at once"
     tell(stage, 0, 1)
-    options = pycolmap.GlobalPipelineOptions()
-    options.random_seed = 0
-    options.num_threads = options.mapper.num_threads = job.threads
+    options = pycolmap.GlobalPipelineOptions(random_seed=0, num_threads=job.threads)
+    options.mapper.num_threads = job.threads
     options.mapper.bundle_adjustment.ceres.solver_options.num_threads = job.threads
     copy = folder / "database.db"  # its focal lengths change; the other mapper keeps the original
     shutil.copyfile(database, copy)
-    calibration = pycolmap.ViewGraphCalibrationOptions()  # finds focal lengths, and wrong ones of EXIF
-    calibration.random_seed = 0
-    pycolmap.calibrate_view_graph(copy, calibration)
+    # finds focal lengths, and wrong ones of EXIF
+    pycolmap.calibrate_view_graph(copy, pycolmap.ViewGraphCalibrationOptions(random_seed=0))
     models = pycolmap.global_mapping(copy, job.images, folder, options)
     tell(stage, 1, 1)
     return models
@@ -92,9 +90,8 @@ def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) ->
         tell(stage, min(placed, total), total)
 
     tell(stage, 0, total)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = 0
-    options.num_threads = options.mapper.num_threads = job.threads
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=job.threads)
+    options.mapper.num_threads = job.threads
     options.min_model_size = min(10, max(3, total // 2))
     models = pycolmap.incremental_mapping(
         database, job.images, folder, options, next_image_callback=one_more, initial_image_pair_callback=one_more
@@ -126,8 +123,7 @@ def refined(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction
 
 
 def _adjust(model: pycolmap.Reconstruction, job: Job) -> None:
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
+    options = pycolmap.BundleAdjustmentOptions(print_summary=False)
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.solver_options.num_threads = job.threads
     options.ceres.solver_options.max_num_iterations = 50
@@ -148,9 +144,8 @@ def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
     pairs.match(job, database, tell)
     tell("triangulating", 0, 1)
     model = _known(job, database)
-    options = pycolmap.IncrementalPipelineOptions()
-    options.random_seed = 0
-    options.num_threads = options.mapper.num_threads = job.threads
+    options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=job.threads)
+    options.mapper.num_threads = job.threads
     options.mapper.filter_max_reproj_error *= job.pixel
     options.triangulation.complete_max_reproj_error *= job.pixel
     options.triangulation.merge_max_reproj_error *= job.pixel

@@ -33,8 +33,10 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
     total = len(job.order)
     tell("finding features", 0, total, counts="keypoints")
     ids = zip(job.cameras, camera_ids(job, database), strict=True)
-    groups = [(group, _reader(job, group, camera_id)) for group, camera_id in ids]
-    single = {"camera_mode": pycolmap.CameraMode.SINGLE}
+    single, groups = {"camera_mode": pycolmap.CameraMode.SINGLE}, []
+    for group, camera_id in ids:
+        camera = {"camera_model": group.camera.model, "existing_camera_id": camera_id}
+        groups.append((group, pycolmap.ImageReaderOptions(**camera, mask_path=job.masks or "")))
     for group, reader in groups:  # before extraction, whose threads would number the photographs in any order
         pycolmap.import_images(database, job.images, image_names=group.names, options=reader, **single)
     for group, reader in groups:
@@ -54,19 +56,9 @@ def camera_ids(job: Job, database: Path) -> list[int]:
         return [camera.camera_id for camera in opened.read_all_cameras()]
 
 
-def _reader(job: Job, group: CameraGroup, camera_id: int) -> pycolmap.ImageReaderOptions:
-    options = pycolmap.ImageReaderOptions()
-    options.camera_model = group.camera.model
-    options.existing_camera_id = camera_id
-    if job.masks is not None:
-        options.mask_path = job.masks
-    return options
-
-
 def _extraction(job: Job, group: CameraGroup) -> pycolmap.FeatureExtractionOptions:
-    options = pycolmap.FeatureExtractionOptions()
     scale = SPHERICAL_SCALE if group.camera.model == SPHERICAL_MODEL else 1
-    options.max_image_size = job.max_image_size * scale
+    options = pycolmap.FeatureExtractionOptions(max_image_size=job.max_image_size * scale)
     options.sift.max_num_features = job.max_features
     side = min(max(group.camera.size), options.max_image_size)
     options.sift.first_octave = -1 if side < SMALL * scale else 0
@@ -79,8 +71,7 @@ def match(job: Job, database: Path, tell: StageProgress, every: bool = False) ->
     if every or not listed.exists():
         pairs = list(combinations(range(len(job.order)), 2)) if every else choose(job, database, tell)
         write_file(listed, "".join(f"{job.order[i]} {job.order[j]}\n" for i, j in pairs).encode())
-    options = pycolmap.ImportedPairingOptions()
-    options.match_list_path = listed
+    options = pycolmap.ImportedPairingOptions(match_list_path=listed)
     total = len(listed.read_text("utf8").splitlines())
     tell("comparing photographs", 0, total, counts="two_view_geometries")
     verification = pycolmap.TwoViewGeometryOptions()

@@ -22,8 +22,7 @@ LITTLE_SPACE = 50_000_000  # free bytes below which a failure counts as a full d
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
-    """Run a job, and return the worker's result; `source` is for messages. Raises CaptureError: there are no poses, or
-    COLMAP ended without a result."""
+    """Run a job, and return the worker's result. Raises CaptureError: there are no poses, or COLMAP failed."""
     work = Path(job.work)
     watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:

@@ -5,14 +5,15 @@ import os
 import re
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from bitymi_ns.capture.folder_contents import passed_over, result_in
+from bitymi_ns.capture.folder_contents import images_of, passed_over, result_in
 from bitymi_ns.capture.kinds import PHOTOGRAPHS
+from bitymi_ns.capture.recognise import Found, models_in
 from bitymi_ns.capture.types import MAP_FILES, MapFiles, Photograph, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed, told_apart
 
@@ -46,7 +47,7 @@ class FileFinder:
     def find(self, name: str) -> Path | None:
         """Find a file; None = none, or more than one."""
         for exact in (name, name.replace("\\", "/")):
-            if self._allowed(exact) and os.path.isfile(self.folder / exact):
+            if (self.outside or leads_inside(exact)) and os.path.isfile(self.folder / exact):
                 return self.folder / exact
         parts = folded(name)
         if not parts:
@@ -62,12 +63,9 @@ class FileFinder:
         unique = [users[path] == 1 or (same and sure[path] == 1) for path, same in zip(found, exact, strict=True)]
         return [path if alone else None for path, alone in zip(found, unique, strict=True)]
 
-    def _allowed(self, name: str) -> bool:
-        return self.outside or leads_inside(name)
-
     def missing(self, name: str) -> Path:
         """Return a path to show for a missing file."""
-        if self._allowed(name):
+        if self.outside or leads_inside(name):
             return self.folder / name
         parts = PurePosixPath(name.replace("\\", "/").replace("\0", "_")).parts
         return self.folder.joinpath(*("_" if part in ("/", "//", "..") else part for part in parts))
@@ -98,8 +96,11 @@ class FileFinder:
 
     @cached_property
     def _whole(self) -> dict[Parts, list[Path]]:
-        table: dict[Parts, list[Path]] = defaultdict(list)
-        for path in sorted(self._walk()):
+        table, paths = defaultdict(list), []
+        for folder, below, files in os.walk(self.folder):
+            below[:] = [name for name in below if not name.startswith(".") and not result_in(Path(folder, name))]
+            paths += [Path(folder, name) for name in files if name.lower().endswith(self.extensions)]
+        for path in sorted(paths):
             table[folded(path.relative_to(self.folder).as_posix())].append(path)
         return dict(table)
 
@@ -109,11 +110,6 @@ class FileFinder:
         for parts, files in self._whole.items():
             table[without_extension(parts)] += files
         return dict(table)
-
-    def _walk(self) -> Iterator[Path]:
-        for folder, below, files in os.walk(self.folder):
-            below[:] = [name for name in below if not name.startswith(".") and not result_in(Path(folder, name))]
-            yield from (Path(folder, name) for name in files if name.lower().endswith(self.extensions))
 
 
 # os.path.isfile, unlike Path.is_file, is False for paths too long for the file system, instead of raising.
@@ -140,13 +136,13 @@ def smaller_copies(files: Iterable[Path]) -> str:
     return ""
 
 
-def name_unused(folder: Path, used: Iterable[Path | None], downscale: int | None = None) -> None:
-    """Report the pictures of a capture that are not `used`, except folders of copies smaller by `downscale`, such as
-    `images_2`."""
-    named = frozenset(Path(os.path.normpath(path)) for path in used if path is not None)
-    copies = None if downscale is None else f"_{downscale}"
-    if others := passed_over(Path(os.path.normpath(folder)), named, copies):
-        say(f"Not taken for photographs in {folder}: {listed(others, most=12)}.")
+def name_unused(found: Found, used: Iterable[Path | None], masks: Iterable[Path | None], downscale: int | None) -> None:
+    """Report pictures that are neither `used` nor `masks`, except copies smaller by `downscale`, such as `images_2`."""
+    named, masked = ({Path(os.path.normpath(path)) for path in some if path is not None} for some in (used, masks))
+    folder, copies = Path(os.path.normpath(found.folder)), None if downscale is None else f"_{downscale}"
+    models = {images: model for model in models_in(folder) for images in images_of(folder / model)}
+    if others := passed_over(folder, named, copies, masked, models):
+        say(f"Not taken for photographs in {found.folder}: {listed(others, most=12)}.")
 
 
 def _hint(folder: Path, file: Path, named: Sequence[Path]) -> str:
@@ -186,8 +182,7 @@ def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks:
 
 
 def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:
-    """Find the photographs that the metadata file `path` names; missing ones keep their stated names. Fail if a name
-    fits more than one file."""
+    """Find the photographs that a file names; missing ones keep their names. Fail if a name fits several files."""
     folder = path.parent
     finder = FileFinder(folder, outside=True)
     found = finder.find_all(names)
@@ -227,8 +222,7 @@ def find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -
 
 
 def find_named(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: bool = False) -> list[int]:
-    """Find photographs by names that may differ in case, Unicode form, extension, and with `any_folder` leading
-    folders; see `splits.by_names`."""
+    """Find photographs by names that may differ in case, Unicode form, extension and (`any_folder`) leading folders."""
     forms: list[Callable[[str], tuple[str, ...]]] = [
         lambda name: PurePath(name.replace("\\", "/")).parts,
         folded,

@@ -5,7 +5,7 @@ import os
 import re
 import shlex
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 
@@ -156,16 +156,22 @@ def is_rendered_film(path: Path) -> bool:
 
 
 def passed_over(
-    folder: Path, used: Collection[Path] | None = None, copies: str | None = None, masks: Collection[Path] = ()
+    folder: Path,
+    used: Collection[Path] | None = None,
+    copies: str | None = None,
+    masks: Collection[Path] = (),
+    models: Mapping[Path, Path] | None = None,
 ) -> list[str]:
     """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out, but
-    `masks`; given the `used` files, also other photographs in their folders and one level below. Folders whose names
-    end in `copies` are left out: smaller copies, such as `images_2`."""
+    `masks` and others beside them; given the `used` files, also other photographs in their folders and one level below,
+    with the `models` that have these. Folders whose names end in `copies` (as `images_2`) are left out."""
     # a folder of captures may hold a whole disk
     among = None if used is None else {above for path in used for above in path.parents}
     groups: dict[tuple[Kind | None, Path, str], list[Path]] = defaultdict(list)
-    found, known = [], {*(used or ()), *masks}
+    found, known, masked = [], {*(used or ()), *masks}, {above for mask in masks for above in mask.parents}
     for path, kind in look_in(folder, among):
+        if kind in kinds.OF_MASKS and (path if path.is_dir() else path.parent) in masked:
+            continue
         if kind is not None and path.is_dir():
             count = sum(is_picture(each) and each not in known for each in path.rglob("*"))
             if count and not (copies and path.name.endswith(copies)):
@@ -174,7 +180,9 @@ def passed_over(
             groups[kind, path.parent, path.suffix.lower() if kind in kinds.UNREAD else ""].append(path)
     for (kind, parent, ending), paths in groups.items():
         if kind is None:
-            found.append(f"pictures of {parent} that nothing names ({listed([path.name for path in paths], most=2)})")
+            own = (models or {}).get(parent) if all(path.parent != parent for path in known) else None
+            whose = "nothing names" if own is None else f"belong to the model {own}"
+            found.append(f"pictures of {parent} that {whose} ({listed([path.name for path in paths], most=2)})")
         elif ending:
             found.append(f"{len(paths)} {ending} of {parent} ({kind.what}, which is not read{_use(kind)})")
         else:

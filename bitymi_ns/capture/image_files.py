@@ -16,7 +16,7 @@ from PIL import EpsImagePlugin, ExifTags, Image, ImageCms
 
 from bitymi_ns.capture.exif import exif_stops, exposure_settings
 from bitymi_ns.capture.folder_contents import open_picture
-from bitymi_ns.capture.types import fail, parsing
+from bitymi_ns.capture.types import Photograph, fail, parsing
 
 S, T = TypeVar("S"), TypeVar("T")
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
@@ -109,8 +109,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Scale grey of more than 8 bits to 8 bits, keeping the EXIF orientation. Raises ValueError: the range is
-    unknown."""
+    """Scale grey of more than 8 bits to 8, keeping the EXIF orientation. Raises ValueError: the range is unknown."""
     if not image.mode.startswith(("I", "F")):
         return image
     values = np.asarray(image, dtype=np.float64)
@@ -163,6 +162,14 @@ def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:
     pixels = np.array(image, np.uint8)
     opaque = pixels.shape[-1] == 4 and pixels[..., 3].min(initial=255) == 255
     return np.ascontiguousarray(pixels[..., :3]) if opaque else pixels
+
+
+def check_sizes(photographs: Sequence[Photograph]) -> None:
+    """Fail if a photograph has another size than its camera, before time is spent on the others."""
+    whole = [each for each in photographs if not each.downscaled]
+    for each, size in zip(whole, in_threads(lambda each: image_size(each.file), whole), strict=True):
+        if size not in (None, each.camera.size):  # unreadable ones are reported when they are read
+            fail(wrong_size(each.file, size, each.camera.size))
 
 
 _REPLACE = "Replace it or remove it from the capture."

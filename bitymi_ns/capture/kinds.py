@@ -55,6 +55,7 @@ FOLDERS = (
     Kind("NAME", "raw copies of corrected pictures", "corrected_NAME"),
 )
 """Folders without photographs; NAME of a folder beside them."""
+OF_MASKS = (DYNAMIC, MASK, FOLDERS[0])
 RESULTS = (
     Kind("bundle.json", "pictures of a bundle", mark=b'"bitymi-bundle"'),
     Kind("config.yml", "pictures of a training run", mark=b"!!python/object"),
@@ -114,4 +115,5 @@ LISTS = (
 )
 """Lists of names of photographs, beside a COLMAP model, by split."""
 NSVF = (Kind("0_*", "train"), Kind("1_*", "val"), Kind("2_*", "test"))
-"""Names of photographs by split."""
+PROCESSED = (Kind("frame_train_*", "train"), Kind("frame_eval_*", "test"))
+"""Names of photographs by split: of NSVF, and of ns-process-data."""

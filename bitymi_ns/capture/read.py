@@ -14,21 +14,22 @@ from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_p
 from bitymi_ns.capture.find_files import check_photographs_exist, downscaled, name_unused
 from bitymi_ns.capture.folder_contents import photo_folder
 from bitymi_ns.capture.frame import read_frame
+from bitymi_ns.capture.image_files import check_sizes
+from bitymi_ns.capture.kinds import NSVF
 from bitymi_ns.capture.masks import check_masks, with_masks
 from bitymi_ns.capture.points import Points, cloud_beside, read_cloud, with_colors
 from bitymi_ns.capture.pose_checks import fit_scale
 from bitymi_ns.capture.readings import AUTO, WRITTEN, Reading, as_meant
 from bitymi_ns.capture.recognise import SPLITS, Format, Found, is_model, recognise
 from bitymi_ns.capture.scanner_views import Y_UP, scanner_photographs
-from bitymi_ns.capture.sfm_poses import KeptPoses, find_sfm_source, kept_source, read_kept_poses
+from bitymi_ns.capture.sfm_poses import find_sfm_source, kept_source, read_kept_poses
 from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, lists_by_name, read_split_lists
 from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
 from bitymi_ns.capture.types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.exit_messages import line_of
 from bitymi_ns.trust import listed
 
-Choice = Literal["auto", "triangulate", "random"]
-"""auto = the capture's points, else triangulated ones."""
+Choice = Literal["auto", "triangulate", "random"]  # auto = the capture's points, else triangulated ones
 WITH_MODEL = ("colmap", "photographs", "video")  # formats read as a COLMAP model
 SCANNED = ("polycam", "record3d", "3d-scanner", "stray-scanner", "pose-files")  # with poses of scanners
 FRAMED = ("nerfstudio", *WITH_MODEL, *SCANNED)  # whose poses are oriented, centered and scaled
@@ -97,7 +98,7 @@ class CaptureOptions(SplitOptions, FrameOptions):
 
     def find(self) -> Found:
         """Recognize the capture. Raises CaptureError: there is none, or an option is for another format."""
-        kept, data = self.kept(), Path(self.data)
+        kept, data = read_kept_poses(self.poses), Path(self.data)
         found = recognise(data, self.format, self.colmap_path) if kept is None else kept.found(data)
         for name, formats in OPTION_FORMATS.items():
             default = getattr(type(self).__dataclass_fields__.get(name), "default", None)
@@ -108,15 +109,11 @@ class CaptureOptions(SplitOptions, FrameOptions):
                 )
         return found
 
-    def kept(self) -> KeptPoses | None:
-        """Read the poses that a run was trained with; None = none."""
-        return None if self.poses is None else read_kept_poses(Path(self.poses))
-
     def source(self, found: Found, need_photos: bool = True) -> Source:
         """Find the COLMAP model and its photographs; photographs without poses go through structure from motion."""
         if found.format == "colmap":
             return find_source(found, self.images_path, self.downscale_factor or 1, need_photos)
-        if (kept := self.kept()) is not None:
+        if (kept := read_kept_poses(self.poses)) is not None:
             return kept_source(found, kept, need_photos)
         if self.poses is not None:
             warn(f"The poses that the run was trained with are no longer in {self.poses}: others can be found now.")
@@ -228,7 +225,8 @@ class _Reader:
             say(f"{read.path} asks for the orientation method {frame.orientation_method}.")
         if auto and "ply_file_path" in meta:
             hint = f"Put it there again, or remove ply_file_path from {read.path} to start from random points."
-            own = self._cloud(found.folder / meta["ply_file_path"], hint, photographs)
+            path = found.folder / meta["ply_file_path"]
+            own = self._colored(*read_cloud(path, hint), photographs, path)
         elif model is not None:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
         scale = float(meta.get("applied_scale", 1.0))
@@ -263,7 +261,8 @@ class _Reader:
         what = f"{source} ({found.format}, {len(photographs)} photographs with their poses)"
         photographs = self._checked(what, photographs, named, source)
         points = self._points(None, photographs, source)
-        lists = lists_by_name([each.file for each in photographs] if found.format == "pose-files" else [])
+        files = [each.file for each in photographs] if found.format == "pose-files" else []
+        lists = lists_by_name(files, NSVF, "NSVF's names")
         return Capture(found.format, source, photographs, points, self.options, lists, downscale=self.downscale)
 
     def _blender(self) -> Capture:
@@ -307,19 +306,15 @@ class _Reader:
         if self.need_photos:
             check_photographs_exist(Path(source), [each.file for each in photographs])
             check_masks(photographs)
+            check_sizes(photographs)
         if self.found.format in ("photographs", "video"):
             return list(photographs)
         if self.need_photos:
-            named = (*named, *(each.mask for each in photographs))
-            name_unused(self.found.folder, named, self.options.downscale_factor)
+            name_unused(self.found, named, [each.mask for each in photographs], self.options.downscale_factor)
         convention, asked = CONVENTIONS.get(self.found.format, (Reading(), np.eye(4))), self.options.poses_as
         asked = asked if asked != AUTO or self.need_photos else WRITTEN
         meant, self.mirror, self.poses_as = as_meant(photographs, *convention, source, asked)
         return meant
-
-    def _cloud(self, path: Path, remedy: str, photographs: Sequence[Photograph]) -> Points:
-        points, reason = read_cloud(path, remedy)
-        return self._colored(points, reason, photographs, path)
 
     def _colored(self, points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
         points = self._placed(points)
@@ -331,14 +326,14 @@ class _Reader:
 
     def _points(self, own: Points | None, photographs: Sequence[Photograph], source: str) -> Points | None:
         """Choose the points to start from: of --ply-path, the capture's `own`, those of a PLY file beside it that shows
-        the same surfaces as triangulated ones, or these, which its folder caches; None = random ones. `source` of the
-        poses is for messages."""
+        the same surfaces as triangulated ones, or these; None = random ones. `source` is for messages."""
         auto, folder = self.options.points == "auto", self.found.folder
         if self.options.points == "random":
             return None
         if auto and self.options.ply_path is not None:
-            hint = "Put it there again, or leave --ply-path out."
-            return self._cloud(folder / self.options.ply_path, hint, photographs)
+            path = folder / self.options.ply_path
+            cloud = read_cloud(path, "Put it there again, or leave --ply-path out.")
+            return self._colored(*cloud, photographs, path)
         if auto and own is not None and len(own.xyz):
             return own
         if not self.want_points:

@@ -21,8 +21,7 @@ from bitymi_ns.trust import Refused, leads_inside, listed
 
 MODEL = Path("sparse/0")
 IMAGES = "images"
-ORIGIN = "origin.json"
-"""File of the model's `Origin`; a folder without it holds at most a report."""
+ORIGIN = "origin.json"  # file of the model's `Origin`; a folder without it holds at most a report
 
 
 @dataclass(frozen=True)
@@ -67,8 +66,7 @@ def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings
 
 
 def kept_source(found: Found, kept: KeptPoses, need_photos: bool) -> Source:
-    """Return the model that a run was trained with. Raises CaptureError: needed photographs of it are missing, or have
-    changed their size."""
+    """Return the model of a run. Raises CaptureError: needed photographs are missing, or have changed their size."""
     photographs = kept.origin.photographs
     images = kept.folder / IMAGES if photographs is None else found.folder / photographs
     source = Source(kept.folder / MODEL, images, kept.left_out)
@@ -97,11 +95,11 @@ def has_kept_poses(folder: Path) -> bool:
     return (folder / ORIGIN).is_file()
 
 
-def read_kept_poses(folder: Path) -> KeptPoses | None:
+def read_kept_poses(folder: Path | None) -> KeptPoses | None:
     """Read the poses kept in a run's folder; None = none. Raises CaptureError: ORIGIN cannot be read."""
-    path = folder / ORIGIN
-    if not path.is_file():
+    if folder is None or not has_kept_poses(folder := Path(folder)):
         return None
+    path = folder / ORIGIN
     which = f"{path}, which says of what the poses of the run were found,"
     with parsing(which, f"Put the folder {folder} back as it was, or train again."):
         values: dict[str, Any] = read_json(path)
@@ -115,8 +113,7 @@ def read_kept_poses(folder: Path) -> KeptPoses | None:
 
 
 def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
-    """Return the settings with which structure from motion found the kept poses; warn of requested ones, other than
-    defaults, that are not used."""
+    """Return the settings of a run's kept poses; warn of requested ones, other than defaults, that are not used."""
     kept = read_kept_poses(folder)
     settings = None if kept is None else kept.origin.settings
     unused = []
@@ -135,8 +132,7 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
 
 def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
     """Copy a model into an existing folder, and its photographs if they are upright copies or frames: hard links where
-    possible, symbolic links as they are. Raises OSError: something cannot be written, or a name in the model leads out
-    of its folder."""
+    possible, symbolic links as they are. Raises OSError: it cannot be written, or a name leads out of the folder."""
     copy_files(source.folder, folder / MODEL)
     if origin.photographs is None:
         for image in source.model.images:

@@ -11,7 +11,7 @@ import numpy as np
 
 from bitymi_ns.capture.find_files import find_named
 from bitymi_ns.capture.folder_contents import kind_of
-from bitymi_ns.capture.kinds import LISTS, NSVF
+from bitymi_ns.capture.kinds import LISTS, PROCESSED, Kind
 from bitymi_ns.capture.types import Photograph, fail, parsing, warn
 from bitymi_ns.safe_reading import read_text
 from bitymi_ns.trust import listed, told_apart
@@ -65,8 +65,8 @@ def split_members(split: Split, groups: Sequence[int]) -> Split:
 
 
 def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: SplitOptions) -> Split:
-    """Split photographs by `eval_names`, else the capture's lists, else a rule; frames of a rig stay together, except
-    by lists. Raises CaptureError: a name matches no photograph, or several."""
+    """Split photographs by `eval_names`, else the capture's lists or names, else a rule; frames of a rig stay together,
+    except by lists. Raises CaptureError: a name matches no photograph, or several."""
     names = [photograph.file for photograph in photographs]
     first: dict[object, int] = {}
     frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
@@ -76,6 +76,8 @@ def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: S
         split = by_names(names, options.eval_names, "--eval-names")
         held = {frames[i] for i in split.held_out}
         return split_members(Split(sorted(set(frames) - held), sorted(held), split.rule), frames)
+    if not lists.names and (options.eval_mode, options.eval_interval) == ("interval", SplitOptions.eval_interval):
+        lists = lists_by_name(names, PROCESSED, "ns-process-data's names")  # unless the user states a rule
     if lists.names:
         return by_lists(names, lists)
     of_first = [names[i] for i in groups]
@@ -155,14 +157,13 @@ def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLi
     return NameLists({"test": known} if known else {}, str(test))
 
 
-def lists_by_name(files: Sequence[Path]) -> NameLists:
-    """List photographs by NSVF's names, which begin with 0_, 1_ or 2_; no lists unless all do, and some with 0_ and
-    some with another."""
+def lists_by_name(files: Sequence[Path], rows: Sequence[Kind], source: str) -> NameLists:
+    """List photographs by names of splits; no lists unless rows name all, some for training and some for others."""
     found: dict[str, list[str]] = {}
     for file in files:
-        row = kind_of(file, NSVF)
+        row = kind_of(file, rows)
         found.setdefault("" if row is None else row.what, []).append(str(file))
-    return NameLists({} if "" in found or "train" not in found or len(found) < 2 else found, "NSVF's names")
+    return NameLists({} if "" in found or "train" not in found or len(found) < 2 else found, source)
 
 
 Pair = tuple[int, int]  # index of a training photograph, and of a held-out one

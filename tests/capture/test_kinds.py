@@ -17,6 +17,7 @@ from bitymi_ns.capture.kinds import (
     NSVF,
     PICTURES,
     POSES,
+    PROCESSED,
     RENDERS,
     RESULTS,
     UNREAD,
@@ -37,7 +38,7 @@ TABLES = {
     "Poses, not read": POSES,
     "Pictures of models": IMAGES_OF,
     "Clouds": CLOUDS,
-    "Splits": (*LISTS, *NSVF),
+    "Splits": (*LISTS, *NSVF, *PROCESSED),
 }
 
 
@@ -138,6 +139,7 @@ def test_lists_of_splits(row: Kind, name: str, whose: str, tmp_path: Path) -> No
     assert read_split_lists(tmp_path, tmp_path, []).names == {row.what: ["a.png"]}
 
 
-def test_names_of_splits() -> None:
-    files = {row.what: [name] for row, name, _ in of(NSVF)}
-    assert lists_by_name([Path(*names) for names in files.values()]).names == files
+@pytest.mark.parametrize("rows", [NSVF, PROCESSED])
+def test_names_of_splits(rows: tuple[Kind, ...]) -> None:
+    files = {row.what: [name] for row, name, _ in of(rows)}
+    assert lists_by_name([Path(*names) for names in files.values()], rows, "").names == files

@@ -213,6 +213,8 @@ def declared(path: Path, width: int, height: int) -> None:
 def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
     path = images_of(capture)[index]
     declared(path, 16320, 12240)  # a phone's 200-megapixel sensor
+    camera = {"w": 16320, "h": 12240, "fl_x": 13600.0, "fl_y": 13600.0, "cx": 8160.0, "cy": 6120.0}
+    edit(capture, lambda meta: meta["frames"][index].update(camera))
     manager = load(capture, points="random")
     assert len(manager.train_dataset) == 10
     declared(path, 60000, 60000)

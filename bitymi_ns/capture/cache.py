@@ -39,9 +39,7 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
     works there, or neither can be written."""
     beside, cache = home(photographs), user_cache()
     problem: OSError | None = None
-    for root in (beside, cache):
-        if root is None:
-            continue
+    for root in filter(None, (beside, cache)):
         folder = root / f"{kind}-{key}"
         try:
             root.parent.mkdir(parents=True, exist_ok=True)
@@ -74,8 +72,7 @@ def home(photographs: Path) -> Path:
 
 
 def made_once(photographs: Path, key: str, kind: Kind, tell: Tell, make: Callable[[Path], None]) -> Path:
-    """Return the work folder of this key, filled by `make` unless it is complete; several processes may read it. Raises
-    CaptureError: see `work_folder`."""
+    """Return the work folder of this key, filled once by `make`. Raises CaptureError: see `work_folder`."""
     for root in (home(photographs), user_cache()):
         if root is not None and is_own(root) and is_own(folder := root / f"{kind}-{key}"):
             with suppress(OSError):
@@ -91,9 +88,8 @@ def made_once(photographs: Path, key: str, kind: Kind, tell: Tell, make: Callabl
 
 
 def replace_stale(work: Path, photographs: Path, contents: str) -> None:
-    """Record the source of a locked work folder, and remove the folders beside it of earlier contents of this source,
-    whose keys cannot recur. Keep those of other options, on which runs were trained, and those in use. `contents`: key
-    of the source's files alone."""
+    """Record the source of a locked work folder and the key of its files (`contents`), and remove the folders beside it
+    of earlier contents. Keep those of other options, on which runs were trained, and those in use."""
     source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # relative: both may move
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):

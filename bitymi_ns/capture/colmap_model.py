@@ -32,8 +32,7 @@ CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 
 
 class ModelImage(NamedTuple):
-    """Photograph: name, camera, world to camera as quaternion (wxyz) and translation, and its rig's frame; None = it
-    stands alone."""
+    """Photograph: name, camera, world to camera (quaternion wxyz, translation), and its rig's frame; None = no rig."""
 
     name: str
     camera_id: int
@@ -122,10 +121,8 @@ def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: 
     """Warn if a binary model beside the text that is read differs from it."""
     if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
         return
-    differences = []
     count = image_count(folder)  # of the binary form, if there is one
-    if count != images:
-        differences.append(f"{images} images in text and {count} in binary form")
+    differences = [f"{images} images in text and {count} in binary form"] if count != images else []
     path = folder / "cameras.bin"
     if path.is_file() and dict(_parsed(path)) != cameras:
         differences.append("other cameras in text than in binary form")

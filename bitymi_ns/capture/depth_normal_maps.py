@@ -28,8 +28,7 @@ MOST_LARGER = 8  # largest ratio of a map's side to its photograph's, which may 
 MOST_NUMBERS = 1 << 28  # most numbers of a map: 80 million normals, or 260 million depths
 FARTHEST = 65504.0  # depth from which on numbers mean "no depth": the largest half float, below Blender's 1e10
 
-Check = Callable[[tuple[int, ...]], None]
-"""Receives a header's shape, and raises if it must not be read."""
+Check = Callable[[tuple[int, ...]], None]  # receives a header's shape, and raises if it must not be read
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # a damaged map gets one message, without OpenCV's
 (getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)

@@ -46,8 +46,7 @@ def read_exif(image: Image.Image) -> Exif:
 
 
 def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[float | None, str]:
-    """Compute the focal length in pixels from the Exif IFD and the stored width and height, and why a stated one is not
-    used."""
+    """Compute the focal length in pixels from the Exif IFD and the stored size, and why a stated one is not used."""
     long, short = max(size), min(size)
     film = number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     millimetres = number(detail.get(ExifTags.Base.FocalLength))
@@ -99,8 +98,7 @@ def exposure_exif(image: Image.Image) -> Image.Exif:
 
 
 def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
-    """Read shutter time (seconds), f-number and ISO of an opened image; None without a time. Raises errors of Pillow's,
-    of many kinds, on broken EXIF."""
+    """Read shutter time (seconds), f-number and ISO; None without a time. Raises many errors on broken EXIF."""
     detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
     values = []
     for tag in EXPOSURE:
@@ -119,8 +117,7 @@ def exif_stops(seconds: float, f_number: float, iso: float) -> float:
 def _up(
     image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
 ) -> tuple[float, float, float] | None:
-    """Find up from a phone's accelerometer; None = none stated, the phone moved, or the photograph is shown in another
-    orientation."""
+    """Find up from a phone's accelerometer; None = none stated, the phone moved, or the picture is turned otherwise."""
     note = detail.get(ExifTags.Base.MakerNote)
     if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
         return None

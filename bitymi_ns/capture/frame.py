@@ -67,8 +67,7 @@ def gps_line(folder: Path) -> str:
 def local_positions(
     gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
-    """Convert GPS positions (latitude, longitude and altitude by name) to east, north and up in metres at their middle;
-    return that, too."""
+    """Convert GPS positions (degrees, metres) to east, north and up in metres at their middle; return that, too."""
     if not gps:
         return {}, None
     values = np.array(list(gps.values()))
@@ -85,10 +84,9 @@ def move_to_world(
     gps: Mapping[str, tuple[float, float, float]],
     ups: Mapping[str, tuple[float, float, float]] | None = None,
 ) -> WorldFrame:
-    """Transform a model in place to a world with z up. Up is that of the accelerometers if most agree and GPS's up, if
-    known, is within 45 degrees of it; else GPS's if its positions determine it, else the cameras' mean. Scale and north
-    are GPS's if its positions determine them. `gps`: latitude, longitude and altitude by name; `ups`: unit vectors away
-    from the ground, in the cameras' axes (OpenCV)."""
+    """Transform a model in place to a world with z up: that of the accelerometers if most agree and GPS's up, if known,
+    is within 45 degrees of it; else GPS's if its positions determine it, else the cameras' mean. Scale and north are
+    GPS's if it determines them. `gps`: degrees and metres; `ups`: unit vectors in the cameras' axes (OpenCV)."""
     up = _by_gravity(model, ups or {})
     local, origin = local_positions(gps)
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}

@@ -84,8 +84,7 @@ class Lens:
     def turn(self) -> npt.NDArray[np.float64]:
         """[4, 4] rotation of the result's camera axes to the photograph's, both OpenCV's."""
         turn = np.eye(4)
-        if self.face:
-            turn[:3, :3] = np.array(FACES[self.face]).T
+        turn[:3, :3] = np.array(FACES[self.face or "front"]).T
         return turn
 
     @property
@@ -161,8 +160,7 @@ class Lens:
 
 def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list[Lens]:
     """Choose the pinhole picture of a camera, for the size to which photographs are downscaled, or faces of a cube if
-    it is wider than MAX_VIEW_ANGLE. `stored`: width and height of the image files, which may be larger. Raises
-    CaptureError: the camera cannot be used."""
+    it is wider than MAX_VIEW_ANGLE. `stored`: size of the files. Raises CaptureError: the camera cannot be used."""
     model, width, height, params = colmap
     camera = colmap.colmap
     if camera.is_spherical():

@@ -17,8 +17,7 @@ from bitymi_ns.capture.sfm_photos import COPY
 from bitymi_ns.capture.types import CaptureError, Photograph, fail, parsing, say
 from bitymi_ns.trust import listed
 
-LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"
-"""Remedy in messages on masks."""
+LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"  # remedy in messages
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
 """Usual folders of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
@@ -29,9 +28,8 @@ MIDDLE = 127  # threshold of lossy masks, of 255
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
     """Find the folder of masks: `stated`, else the first `masks` or `mask` beside the folder `photographs`, in it, or
     in `data`; else that of reduced masks (`masks_2` for a `downscale` of 2). If `data` is the folder of photographs, or
-    in it, a `masks` beside it may belong to something else. It is used if the folder has a usual name: `bed/masks` for
-    `bed/images`, but not `all/masks` for `all/bed`. Raises CaptureError: neither the stated one nor its reduced one
-    exists."""
+    in it, one beside it is used if the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for
+    `all/bed`. Raises CaptureError: neither the stated one nor its reduced one exists."""
     shown, named = Path(os.path.abspath(photographs)), Path(os.path.abspath(data))
     folders = [shown, named]
     if shown.name in USUAL_FOLDERS or not named.is_relative_to(shown):

@@ -47,8 +47,7 @@ def write_capture(poses: FoundPoses, folder: Path, progress: Progress) -> None:
 
 
 def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
-    """Build transforms.json: camera to world with OpenGL axes (x right, y up, z backward), OpenCV distortion, and
-    common entries at the top."""
+    """Build transforms.json: camera to world with OpenGL axes, OpenCV distortion, and common entries at the top."""
     frames = []
     for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
         pose = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])

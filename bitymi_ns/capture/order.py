@@ -15,8 +15,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 
 class Neighbours:
-    """Sequences of photographs: files in one folder, which several cameras may share, whose names differ only in
-    numbers."""
+    """Sequences of photographs: files in one folder, of any cameras, whose names differ only in numbers."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         found = defaultdict(list)

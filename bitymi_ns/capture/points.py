@@ -89,8 +89,7 @@ def cloud_beside(
     folder: Path, found: Points | None, photographs: Sequence[Photograph], placed: Callable[[Points], Points]
 ) -> Points | None:
     """Read a PLY file in a folder that nothing names: the first on whose surfaces most of the points lie that were
-    `found` by triangulation; None = none. `placed` moves points of files to the poses' world. Say why others are not
-    used."""
+    `found` by triangulation; None = none. `placed` moves points of files to the poses' world. Report others."""
     centers = np.stack([each.pose[:3, 3] for each in photographs])
     for path in sorted(path for path in folder.iterdir() if kind_of(path, CLOUDS)):
         try:

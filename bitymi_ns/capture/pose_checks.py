@@ -66,8 +66,7 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
 
 
 def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Check the poses of a transforms.json's frames, one for each photograph, and replace them by rotations, see
-    `rotations`."""
+    """Check the poses of a transforms.json's frames, one for each photograph, and make rotations of them."""
     names = [frame["file_path"] for frame in frames]
     poses, scaled = [], []
     for frame, name in zip(frames, names, strict=True):

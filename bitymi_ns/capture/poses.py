@@ -221,8 +221,8 @@ def make_job(
     sequence: bool,
 ) -> Job:
     """Make the job of these photographs in their order, linked in the work folder under names without spaces for
-    COLMAP's lists. `images`: folder of the upright photographs, `used` their names in it; neighbours overlap in a
-    `sequence`."""
+    COLMAP. `images`: folder of the upright photographs, `used` their names in it; in a `sequence` neighbours
+    overlap."""
     links = emptied(work / "links")
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:

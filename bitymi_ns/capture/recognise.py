@@ -42,8 +42,6 @@ class Found:
 
     def how_to_choose(self) -> str:
         """Describe captures that are not read, and how to read them; empty if there are none."""
-        if not self.others:
-            return ""
         ways = []
         for format, path in self.others:
             option = f"--format {format}"
@@ -52,7 +50,7 @@ class Found:
             elif format == "video" or (path.suffix == ".json" and path.name != "transforms.json"):
                 option = f"--data {path}"
             ways.append(f"{_seen_from(path, self.folder)} (`bitymi-data {option}`)")
-        return f"Not read: {listed(ways)}."
+        return f"Not read: {listed(ways)}." if ways else ""
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
@@ -71,8 +69,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
     fitting = [each for each in candidates if format in ("auto", each[0])]
     if data.is_dir() and all(found in ("photographs", "video") for found, _ in fitting):
-        within = _capture_within(data, format)
-        if within is not None:
+        if (within := _capture_within(data, format)) is not None:
             return recognise(within, format)
     twins: dict[str, Format] = {"instant-ngp": "nerfstudio", "nerfstudio": "instant-ngp"}
     if format in twins and not fitting:  # the user knows better than the entries of the file
@@ -89,8 +86,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:
-    """Find the only subfolder that is a capture with poses, as unpacked archives have; None = none, several, or
-    photographs beside it."""
+    """Find the only subfolder with poses, as unpacked archives have; None = none, several, or photographs beside it."""
     if folder_contents.photographs_in(folder):
         return None
     found = [
@@ -158,8 +154,7 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
 
 
 def _kind_of(file: Path) -> Format:
-    """Tell nerfstudio's transforms.json from instant-ngp's. Unreadable files count as nerfstudio's: its reader reports
-    the error."""
+    """Tell nerfstudio's transforms.json from instant-ngp's; unreadable ones are nerfstudio's, whose reader says so."""
     try:
         meta = read_json(file)
     except (OSError, ValueError):
@@ -180,9 +175,8 @@ def is_model(folder: Path) -> bool:
 
 
 def models_in(data: Path) -> list[Path]:
-    """List COLMAP models at most three levels below a folder, relative to it, by preference: usual folders first; of
-    numbered models side by side (COLMAP writes several if it cannot connect all photographs), those with most images
-    first."""
+    """List COLMAP models at most three levels below a folder, relative to it: usual folders first, and of numbered
+    models side by side (COLMAP writes several if it cannot connect all photographs) those with most images."""
     found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
     models = [path.relative_to(data) for path in found if is_model(path)]
     models = [model for model in models if not any(part.startswith(".") for part in model.parts)]

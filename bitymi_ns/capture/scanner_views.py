@@ -40,8 +40,7 @@ Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0
 
 
 def scanner_photographs(found: Found) -> list[Photograph]:
-    """Read a capture's photographs, with cameras and poses, in the order of their names. Raises CaptureError: a file is
-    damaged."""
+    """Read photographs with cameras and poses, in the order of their names. Raises CaptureError: a file is damaged."""
     readers: dict[str, Callable[[Path], list[ScannedPhotograph]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
         "3d-scanner": _scanner_app, "stray-scanner": _stray_scanner,

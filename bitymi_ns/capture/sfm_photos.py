@@ -62,8 +62,7 @@ class Photo:
 
 
 def find_photos(folder: Path) -> list[str]:
-    """List the photographs in and below a folder in natural order; see `photographs_below`. Raises CaptureError: the
-    folder cannot be read."""
+    """List the photographs in and below a folder in natural order. Raises CaptureError: the folder cannot be read."""
     try:
         os.listdir(folder)
         paths = list(photographs_below(folder))
@@ -147,8 +146,7 @@ def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
 
 
 def seam(grey: npt.NDArray[np.float32]) -> float:
-    """Correlate the details of the left and the right edge; 0 where these are bare, or for other shapes than that of
-    360-degree pictures."""
+    """Correlate the details of the left and right edges; 0 if they are bare, or the picture is no full sphere's."""
     height, width = grey.shape
     if height < 32 or not is_full_sphere(width, height):
         return 0.0
@@ -224,18 +222,16 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
     found: dict[str, str] = {}
     for shape in {photo.thumb.shape for photo in photos}:
         same = sorted((p for p in photos if p.thumb.shape == shape), key=lambda p: -p.sharpness)
-        kept: list[Photo] = []
-        means = np.empty(0)
+        kept: list[tuple[float, Photo]] = []
         for photo in same:
             level = float(photo.thumb.mean())
             # a duplicate has almost the same mean: compare few pixel by pixel
-            near = [kept[i] for i in np.flatnonzero(np.abs(means - level) < 2.0)]
+            near = (other for mean, other in kept if abs(mean - level) < 2.0)
             twin = next((other for other in near if shift(photo.thumb, other.thumb) < DUPLICATE_SHIFT), None)
             if twin is not None:
                 found[photo.name] = twin.name
             else:
-                kept.append(photo)
-                means = np.append(means, level)
+                kept.append((level, photo))
     return found
 
 

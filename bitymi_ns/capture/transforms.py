@@ -66,8 +66,7 @@ class Transforms:
 
 
 def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_masks: bool = True) -> Transforms:
-    """Read a JSON file, see `load_transforms`, and find its photographs, maps and masks. Raises CaptureError: the file
-    cannot be used."""
+    """Read a JSON file, and find its photographs, maps and masks. Raises CaptureError: the file cannot be used."""
     meta = load_transforms(path, own_format)
     frames = meta["frames"]
     lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
@@ -178,8 +177,7 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
 
 
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
-    """Convert an entry, also in quotes, to a number; `label` is for the message. Raises CaptureError: it is no number,
-    or for w and h no number of pixels."""
+    """Convert an entry, also in quotes, to a number. Raises CaptureError: it is none, or no number of pixels (w, h)."""
     try:
         number = float(None if isinstance(value, bool) else value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):

@@ -3,15 +3,19 @@
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.pipeline import RefineOptions, bake, bake_field
 from bitymi_ns.bake.prune import prune_and_resample
-from bitymi_ns.bake.state import BakeState, export
+from bitymi_ns.bake.stages import Coded, Reduced, Rounded, Stage, Trained, export
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.progress import rich_progress
 
 __all__ = [
     "BakeOptions",
-    "BakeState",
+    "Coded",
+    "Reduced",
     "RefineOptions",
+    "Rounded",
+    "Stage",
+    "Trained",
     "PolishOptions",
     "TuneOptions",
     "bake_field",

@@ -9,21 +9,15 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.state import BakeState, joined
+from bitymi_ns.bake.stages import Reduced, Rounded, laid_out, with_means
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.poster import most_bytes as poster_bytes
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec import streams
+from bitymi_ns.codec.pages import joined, tile_means
 from bitymi_ns.codec.surfel_codes import code_surfels
-from bitymi_ns.codec.texel_codes import (
-    RESIDUAL_STEP,
-    SceneCodes,
-    TexelCodeOptions,
-    TexelCoder,
-    TexelCodes,
-    residual_codes,
-)
+from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.views import View
 
@@ -40,7 +34,6 @@ ALTERNATIVES = {0.5: 12.0, 2.0: 1.0 / 32}
 """Bytes, relative to the chosen ones, of the precisions that are stated beside, and first factors of lambda to try."""
 _SEARCH, _TRIES = 7, 4
 _CLOSE = 1.1  # largest ratio of the bytes of an alternative to those wanted, either way
-_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
@@ -80,8 +73,7 @@ class RatePoint:
     """A point of the rate-distortion curve."""
 
     lmbda: float  # squared error per bit
-    baked: BakeState  # with the surfels that are kept, and their codes; its texels are as they were
-    coding: TexelCodeOptions  # of the texels
+    baked: Rounded  # its texels are as they were
     texels: TexelCodes | None  # codes of its texels; None without
     error: float  # mean square error against the training photographs
     psnr: float  # on them, dB
@@ -89,10 +81,9 @@ class RatePoint:
     @cached_property
     def bytes(self) -> int:
         """Count the bytes of surfels and texels; compressed on first use."""
-        codes = self.baked.codes
-        assert codes is not None
-        rest = len(streams.compress(codes.residual).data) if self.texels is None else self.texels.nbytes()
-        return codes.surfels.nbytes() + rest
+        if self.texels is not None:
+            return self.baked.codes.nbytes() + self.texels.nbytes()
+        return self.baked.codes.nbytes() + len(streams.compress(residual_codes(self.baked.texels)).data)
 
 
 class Coder:
@@ -100,36 +91,34 @@ class Coder:
 
     def __init__(
         self,
-        baked: BakeState,
+        baked: Reduced,
         views: Sequence[View],
         background: Tensor,
         options: Compact,
         progress: Progress = no_progress,
-        device: torch.device = _CPU,
         held_out: Sequence[View] = (),
     ) -> None:
         """
         Args:
-            baked: with lean view colours, on the CPU.
+            baked: with lean view colours.
             views: training views; without any the reference steps are taken.
             background: [3] colour behind the scene.
             held_out: views on which alternatives are stated; without any the training views.
         """
-        self._baked, self._pictures = baked, Pictures(views, background, options.views, device)
-        self._held_out = Pictures(held_out, background, options.views, device)
+        self._baked, self._pictures = baked, Pictures(views, background, options.views, baked.device)
+        self._held_out = Pictures(held_out, background, options.views, baked.device)
         scene = baked.unquantised()
         self._sizes = baked.sizes.long()
         drawn = self._pictures.of(scene)
         self.error, self.psnr = self._pictures.square(drawn), self._pictures.psnr(drawn)
         self._numbers = self._pictures.numbers / max(1, self._pictures.views) * len(views)
         reduced = replace(scene, surfels={**scene.surfels, **self._view_colors(START)})
-        self._noise = column_noise(reduced, self._sizes, self._pictures, progress)
-        self._tiles = self._texels = self._coverage = self._alphas = None
+        self._noise = column_noise(reduced, self._sizes, baked.extent, self._pictures, progress)
+        self._residual = tile_means(baked.texels, baked.sizes)[:, :3]
+        self._tiles, self._coverage = None, baked.texels.new_zeros(len(baked.texels), 2)
         if baked.textured:
-            texels = TexelList(baked, device)
-            self._tiles, self._texels = texels.tiles, texels.values.cpu()
-            self._alphas = None if baked.alpha is None else baked.alpha.values
-            self._coverage = texels.coverage(views, progress).cpu()
+            texels = TexelList(baked)
+            self._tiles, self._coverage = texels.tiles, texels.coverage(views, progress).cpu()
 
     @property
     def measured(self) -> bool:
@@ -152,46 +141,42 @@ class Coder:
         surfels = {**baked.scene.surfels, **self._view_colors(lmbda)}
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
         codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)
-        residual = baked.mean_residual[order]
-        listed, coded, coverage = residual, None, None
         coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * lmbda / PER_BIT))))
-        constants = residual
-        if self._texels is not None:
-            moved = self._tiles.rows_of(order.to(self._tiles.size.device)).cpu()
-            texels, coverage = self._texels[moved], self._coverage[moved]
-            coder, listed = TexelCoder(self._sizes[order], coverage[:, 1], coding), texels
-            if self._alphas is not None:
-                listed = joined(texels, coder.code_alpha(self._alphas[moved]))
-                assert coder.alpha is not None
-                constants = joined(residual, coder.alpha.means)
-            coded = coder.code(texels)
-        pages_of = (baked.options.page_width, baked.options.page_rows)
-        kept = SceneCodes(codes, None, residual_codes(residual), RESIDUAL_STEP, *pages_of)
-        in_front = None if baked.in_front is None else baked.in_front[order]
-        rounded = replace(baked, rows=baked.rows[order], codes=kept, in_front=in_front).with_surfels(codes.surfels())
-        rounded = rounded.with_tiles(Tiles(self._sizes[order], codes.extent(baked.options.extent), listed))
-        rounded = replace(rounded.with_constants(constants), coverage=coverage)
-        if self._alphas is not None:
-            rounded = replace(rounded, alpha_codes=coded)
-        shown = rounded
-        if coded is not None:
-            decoded = rounded.with_alpha(coded.texels_of(coder.blocks))
-            shown = replace(rounded, texels=decoded).with_constants(coded.constants)
+        listed = decoded = means = self._residual[order]
+        coverage, coded = self._coverage, None
+        if self._tiles is not None:
+            moved = self._tiles.rows_of(order.to(baked.device)).cpu()
+            texels, coverage = baked.texels[moved, :3], coverage[moved]
+            coder = TexelCoder(self._sizes[order], coverage[:, 1], coding)
+            alphas = None if baked.alpha is None else coder.code_alpha(baked.alpha.values[moved])
+            coded, listed = coder.code(texels), joined(texels, alphas)
+            decoded, means = joined(coded.texels_of(coder.blocks), alphas), coded.means
+        scene = replace(baked.scene, surfels=codes.surfels())
+        rounded = baked.become(
+            Rounded,
+            rows=baked.rows[order],
+            in_front=baked.in_front[order],
+            codes=codes,
+            coding=coding,
+            alpha_codes=None if baked.alpha is None else coded,
+            coverage=coverage,
+            **laid_out(scene, Tiles(self._sizes[order], codes.extent(baked.options.extent), listed), baked.options),
+        )
+        shown = replace(rounded, texels=decoded, scene=with_means(rounded.scene, means))
         drawn = pictures.of(shown.unquantised())
-        return RatePoint(lmbda, rounded, coding, coded, pictures.square(drawn), pictures.psnr(drawn))
+        return RatePoint(lmbda, rounded, coded, pictures.square(drawn), pictures.psnr(drawn))
 
 
 def compacted(
-    baked: BakeState,
+    baked: Reduced,
     views: Sequence[View],
     background: Tensor,
     options: Compact | None = None,
     progress: Progress = no_progress,
-    device: torch.device = _CPU,
     held_out: Sequence[View] = (),
-) -> tuple[BakeState, TexelCodeOptions]:
+) -> Rounded:
     """Round the surfels of a bake to the values of a compact bundle, in Morton order, and choose the coding of the
-    texels, for `tune.tune_atlas` or `with_coded_texels`.
+    texels.
 
     Args:
         baked, views, background, held_out: as in `Coder`.
@@ -200,10 +185,10 @@ def compacted(
         ValueError: the target cannot be reached.
     """
     options = options or Compact()
-    return choose(Coder(baked, views, background, options, progress, device, held_out), options, progress)
+    return choose(Coder(baked, views, background, options, progress, held_out), options, progress)
 
 
-def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> tuple[BakeState, TexelCodeOptions]:
+def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> Rounded:
     """Search lambda and code as `compacted`, with a coder made for the same views."""
     if options.most_bytes is not None:
         enough = coder.allowed(ENOUGH) if coder.measured else -math.inf
@@ -231,15 +216,13 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
         allowed = coder.allowed(options.share)
         added = allowed - coder.error
         found, _ = _search(coder, lambda point: (point.error - coder.error) / added, progress, most=MAX_LAMBDA)
-    baked, coding = found.baked, found.coding
-    assert baked.codes is not None
+    baked = found.baked
     if options.most_bytes is not None:
-        most, binds = options.most_bytes - baked.codes.surfels.nbytes(), found.error > enough
-        coding = replace(coding, most_bytes=most, fill=binds)
+        most, binds = options.most_bytes - baked.codes.nbytes(), found.error > enough
+        baked = replace(baked, coding=replace(baked.coding, most_bytes=most, fill=binds))
     mse = max(0.0, found.error - coder.error) if coder.measured else None
-    rounding = Rounding(mse=mse, steps=dict(baked.codes.surfels.steps), alternatives=_alternatives(coder, found))
-    statistics = baked.statistics.replace(rounding=rounding, certificate=None, view_color=_thinned(baked))
-    return replace(baked, statistics=statistics), coding
+    rounding = Rounding(mse=mse, steps=dict(baked.codes.steps), alternatives=_alternatives(coder, found))
+    return baked.stating(rounding=rounding, view_color=_thinned(baked))
 
 
 def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float]] | None:
@@ -290,18 +273,7 @@ def _search(
     return found[min(found) if low is None else low], found[max(found) if high is None else high]
 
 
-def with_coded_texels(baked: BakeState, options: TexelCodeOptions | None = None) -> BakeState:
-    """Code the texels of a bake with rounded surfels, all with the same weight."""
-    assert baked.codes is not None
-    if not baked.textured:
-        return baked
-    texels, options = baked.texels[:, :3].contiguous(), options or TexelCodeOptions()
-    coder = TexelCoder(baked.sizes, torch.ones(len(texels)), options, baked.alpha_codes)
-    coded = coder.code(texels) if options.most_bytes is None else coder.fit(texels, options.most_bytes)
-    return baked.with_texel_codes(coded, texels)
-
-
-def _thinned(baked: BakeState) -> ViewColorError | None:
+def _thinned(baked: Rounded) -> ViewColorError | None:
     """Update the statistics of the view colours to the terms that are left; the error stays that of their reduction."""
     stated, surfels = baked.statistics.view_color, baked.scene.surfels
     if stated is None:

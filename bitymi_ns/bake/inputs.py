@@ -49,11 +49,6 @@ class BakeInput:
         return replace(self, views=seen)
 
 
-def device_of(cameras: Sequence[Camera]) -> torch.device:
-    """Return the device of the cameras; the CPU without any."""
-    return cameras[0].viewmat.device if cameras else torch.device("cpu")
-
-
 def photo_resolution(inputs: BakeInput) -> Tensor | None:
     """Sample the resolution of the photographs at points of the scene (`scene/sampling.py`).
 

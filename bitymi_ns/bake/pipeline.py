@@ -9,18 +9,20 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.compact import Compact, compacted, with_coded_texels
+from bitymi_ns.bake.compact import Compact, compacted
 from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.field.tiles import field_tiles
-from bitymi_ns.bake.inputs import device_of
 from bitymi_ns.bake.prune import drawable, prune_and_resample
-from bitymi_ns.bake.state import BakeableScene, BakeState, joined
+from bitymi_ns.bake.stages import BakeableScene, Coded, Trained, laid_out
 from bitymi_ns.bake.tile_errors import certified
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.bundle.statistics import KeptSurfels, KeptTexels, Statistics
+from bitymi_ns.bundle.statistics import KeptTexels
+from bitymi_ns.codec.pages import joined
+from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
@@ -29,7 +31,7 @@ from bitymi_ns.trust import listed
 
 
 @torch.no_grad()
-def trained_texels(scene: BakeableScene, options: BakeOptions) -> BakeState:
+def trained_texels(scene: BakeableScene, options: BakeOptions) -> Trained:
     """Bake a scene whose texels were trained: all of its tiles, view colours and drawable surfels; `prune_and_resample`
     then drops what the options say. Without texels no surfel has a tile. Raises ValueError: no surfel is left, an
     option is out of range, or the atlas would be too large."""
@@ -39,17 +41,19 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> BakeState:
     if len(rows) == 0:
         raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
     surfels = {name: value.detach()[rows].float().cpu() for name, value in scene.surfels.items()}
-    rows, count, texels = rows.cpu(), len(rows), None
+    device, rows, count = rows.device, rows.cpu(), len(rows)
     if isinstance(scene.field, TexelField):
         tiles = _tiles_of(scene.field, rows)
     else:
-        sizes = torch.zeros(count, 2, dtype=torch.int32)
-        tiles = Tiles(sizes, torch.full((count,), options.extent), torch.zeros(count, 3))
-    baked = BakeState.of(scene, surfels, rows, tiles, options)
+        none = torch.zeros(count, 2, dtype=torch.int32)
+        tiles = Tiles(none, torch.full((count,), options.extent), torch.zeros(count, 3))
+    drawn = {"near": scene.near, "weight_bound": scene.config.weight_bound}
+    baked = BakedScene(surfels, kind_of(scene.surfels), torch.zeros(0, 5, dtype=torch.int32), **drawn)
+    own = {"rows": rows, "device": device, "trained": trained, "left_out": left_out}
+    stage = Trained(**own, **laid_out(baked, tiles, options), options=options)
     if isinstance(scene.field, TexelField):
-        texels = KeptTexels(learned=baked.packing.texels)
-    counts = KeptSurfels(trained=trained, kept=count, left_out=left_out)
-    return replace(baked, statistics=Statistics(surfels=counts).replace(texels=texels))
+        stage = stage.stating(texels=KeptTexels(learned=stage.packing.texels))
+    return stage
 
 
 def _tiles_of(field: TexelField, rows: Tensor) -> Tiles:
@@ -57,9 +61,7 @@ def _tiles_of(field: TexelField, rows: Tensor) -> Tiles:
     field = copy.deepcopy(field).cpu()
     field.keep(rows)
     bare = field.size.long().prod(1) == 1  # their one texel is their constant
-    texels = field.texels.detach().float()
-    if field.alpha is not None:
-        texels = joined(texels, field.alpha.detach().float())
+    texels = joined(field.texels.detach().float(), None if field.alpha is None else field.alpha.detach().float())
     return Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
 
 
@@ -120,16 +122,18 @@ def bake(
     refine: RefineOptions,
     progress: Progress = no_progress,
     held_out: Sequence[View] = (),
-) -> BakeState:
+) -> Coded:
     """Bake a trained scene, optimise it against the photographs, and encode it for a bundle.
 
     Stages: tiles of the trained texels, or of the field; polish of texels and surfels (field only); reduction of tiles
     and view colours; rounding of the surfels (compact only); fine-tuning of the texels; coding; certificate.
 
+    The scene's device does the work.
+
     Args:
-        cameras: of the training views, on the scene's device.
+        cameras: of the training views.
         photographs: the training views, with the corrections that training found.
-        background: [3] colour behind the scene, on the CPU.
+        background: [3] colour behind the scene.
         held_out: views of which the gains are stated; they decide nothing.
 
     Raises:
@@ -139,22 +143,21 @@ def bake(
     given = [name for name in of_fields if getattr(options, name) != getattr(BakeOptions, name)]
     if given and isinstance(scene.field, TexelField):
         raise ValueError(f"{listed(given)} are for a field: tiles that were trained get smaller by the tolerance")
-    tune, coding, device = refine.tune, None, device_of(cameras)
     form = "compact" if refine.compact is not None else options.format
     options = replace(options, format=replace(options, format=form).texel_format)  # as bundle.json states it
-    polish, baked = refine.polish, trained_texels(scene, options)
+    polish, tune, trained = refine.polish, refine.tune, trained_texels(scene, options)
     if scene.field is not None and not isinstance(scene.field, TexelField):
-        baked = field_tiles(baked, scene.field, cameras, polish and polish.pixels_per_texel, progress)
-    if polish is not None and baked.textured:
-        baked = polish_scene(baked, photographs, background, polish, refine.train, progress, held_out, device)
-    baked = prune_and_resample(baked, cameras, progress)
+        trained = field_tiles(trained, scene.field, cameras, polish and polish.pixels_per_texel, progress)
+    if polish is not None and trained.textured:
+        trained = polish_scene(trained, photographs, background, polish, refine.train, progress, held_out)
+    baked = prune_and_resample(trained, cameras, progress)
     if refine.compact is not None:
-        baked, coding = compacted(baked, photographs, background, refine.compact, progress, device, held_out)
+        baked = compacted(baked, photographs, background, refine.compact, progress, held_out)
     if tune is not None and baked.textured:
-        baked = tune_atlas(baked, photographs, background, tune, progress, held_out, coding, device)
-    if baked.codes is not None and baked.codes.texels is None:
-        baked = with_coded_texels(baked, coding)
-    return certified(baked.encoded(progress), [camera.to("cpu") for camera in cameras])
+        coded = tune_atlas(baked, photographs, background, tune, progress, held_out)
+    else:
+        coded = baked.encoded(progress)
+    return certified(coded, cameras)
 
 
 def bake_field(
@@ -162,11 +165,8 @@ def bake_field(
     cameras: Sequence[Camera] = (),
     options: BakeOptions | None = None,
     progress: Progress | None = None,
-    pixels_per_texel: float | None = None,
-) -> BakeState:
-    """Bake a scene as it is, without photographs; with `pixels_per_texel` only the tiles of its field, for a polish."""
+) -> Coded:
+    """Bake a scene as it is, without photographs."""
     options, progress = options or BakeOptions(), progress or no_progress
     options.check()
-    if pixels_per_texel is not None:
-        return field_tiles(trained_texels(scene, options), scene.field, cameras, pixels_per_texel, progress)
     return bake(scene, cameras, (), torch.zeros(3), options, RefineOptions(), progress)

@@ -88,17 +88,16 @@ class ColumnNoise:
 
 @torch.no_grad()
 def column_noise(
-    scene: BakedScene, sizes: npt.ArrayLike, pictures: Pictures, progress: Progress = no_progress
+    scene: BakedScene, sizes: npt.ArrayLike, extent: Tensor, pictures: Pictures, progress: Progress = no_progress
 ) -> ColumnNoise:
     """Measure the image error of each column rounded alone, at its reference step. `scene`: with lean view colours, on
-    the CPU, of N surfels. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none."""
-    assert scene.extent is not None
-    codes, order = code_surfels(scene.surfels, scene.view_color, sizes, scene.extent, REFERENCE)
+    the CPU, of N surfels. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none. `extent`: [N] their half sides."""
+    codes, order = code_surfels(scene.surfels, scene.view_color, sizes, extent, REFERENCE)
     moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
     moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}
     plain, drawn = replace(scene, surfels=reordered(scene.surfels, order), **moved), pictures.of(scene)
     rounded, tiled = codes.surfels(), torch.from_numpy(codes.sizes[:, 0] > 0)
-    extent = torch.where(tiled, codes.extent(1.0), plain.extent)
+    extent = torch.where(tiled, codes.extent(1.0), extent[order])
     noise, counts = {}, {}
     for done, name in enumerate(REFERENCE):
         column = codes.codes[name]

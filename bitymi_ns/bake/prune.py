@@ -6,11 +6,11 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.inputs import BakeInput, device_of, photo_resolution
-from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.inputs import BakeInput, photo_resolution
+from bitymi_ns.bake.stages import Reduced, Trained
 from bitymi_ns.bake.tiles import Tiles, reduced_tiles
 from bitymi_ns.bake.view_colors import reduce_view_colors
-from bitymi_ns.bundle.statistics import LeftOut
+from bitymi_ns.bundle.statistics import KeptSurfels, LeftOut
 from bitymi_ns.codec.limits import within
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.view_kinds import kind_of
@@ -41,16 +41,17 @@ def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:
 
 
 def drop_unseen(
-    baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress
-) -> tuple[BakeState, BakeInput]:
+    baked: Trained, cameras: Sequence[Camera], progress: Progress = no_progress
+) -> tuple[Trained, BakeInput]:
     """Leave out, and count, the surfels that cannot be drawn or stored and, if the options say so, those that no view
-    blends. Also returns the kept surfels and their visibility, on the cameras' device. Raises ValueError: no surfel is
-    left."""
-    scene, device = baked.scene, device_of(cameras)
+    blends. Also returns the kept surfels and their visibility, on the device of the work. Raises ValueError: no surfel
+    is left."""
+    scene, device = baked.scene, baked.device
     rows, gone = drawable(scene.surfels)
     surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
     alpha = None if baked.alpha is None else baked.alpha.of(rows).to(device)
-    inputs = BakeInput(surfels, cameras, scene.near, scene.weight_bound, alpha=alpha)
+    moved = [camera.to(device) for camera in cameras]
+    inputs = BakeInput(surfels, moved, scene.near, scene.weight_bound, alpha=alpha)
     inputs = inputs.with_visibility(baked.options, progress)
     if inputs.views is not None and baked.options.drop_unseen:
         seen = inputs.views.transmittance > 0
@@ -59,37 +60,29 @@ def drop_unseen(
         raise ValueError("no surfel is left to bake")
     kept = torch.zeros(len(baked.rows), dtype=torch.bool)
     kept[rows] = True
-    counts = baked.statistics.surfels
-    assert counts is not None and counts.left_out is not None
-    left_out = counts.left_out.replace(**{name: (getattr(counts.left_out, name) or 0) + n for name, n in gone if n})
-    statistics = baked.statistics.replace(surfels=counts.replace(kept=len(rows), left_out=left_out))
-    return replace(baked.only(kept), statistics=statistics), inputs
+    left_out = baked.left_out.replace(**{name: (getattr(baked.left_out, name) or 0) + n for name, n in gone if n})
+    return replace(baked.only(kept), left_out=left_out), inputs
 
 
 @torch.no_grad()
-def prune_and_resample(baked: BakeState, cameras: Sequence[Camera], progress: Progress = no_progress) -> BakeState:
-    """Drop surfels as `drop_unseen` does, and reduce tiles and view colours by the bake's options. The atlas is not
-    encoded.
-
-    Args:
-        baked: of `trained_texels` or `field_tiles`.
-        cameras: training views; their device does the work.
-
-    Raises:
-        ValueError: no surfel is left.
-    """
+def prune_and_resample(baked: Trained, cameras: Sequence[Camera], progress: Progress = no_progress) -> Reduced:
+    """Drop surfels as `drop_unseen` does, and reduce tiles and view colours by the bake's options. `cameras`: training
+    views. Raises ValueError: no surfel is left."""
     result, inputs = drop_unseen(baked, cameras, progress)
     surfels, colors, view_color = reduce_view_colors(inputs, baked.options, progress)
     if baked.options.tolerance > 0 and result.textured:
         tiles = Tiles(result.sizes, result.extent, result.texels)
         result = result.with_tiles(reduced_tiles(tiles, inputs, baked.options, progress))
-    in_front = None if inputs.transmittance is None else inputs.transmittance.cpu()
-    result = replace(result.with_surfels(surfels), in_front=in_front, colors=colors)
-    result.scene.photographed = photo_resolution(inputs)
-    statistics = result.statistics
-    assert statistics.surfels is not None
-    bare = int((result.packing.tiles[:, 3] == 0).sum())
-    statistics = statistics.replace(surfels=statistics.surfels.replace(without_tile=bare), view_color=view_color)
-    if statistics.texels is not None:
-        statistics = statistics.replace(texels=statistics.texels.replace(kept=result.packing.texels))
-    return replace(result, statistics=statistics)
+    result = result.with_surfels(surfels)
+    in_front = torch.ones(len(result.rows)) if inputs.transmittance is None else inputs.transmittance.cpu()
+    scene = replace(result.scene, photographed=photo_resolution(inputs))
+    counts = KeptSurfels(
+        trained=result.trained,
+        kept=len(result.rows),
+        left_out=result.left_out,
+        without_tile=int((result.packing.tiles[:, 3] == 0).sum()),
+    )
+    texels = result.statistics.texels
+    return result.become(Reduced, scene=scene, in_front=in_front, colors=colors).stating(
+        surfels=counts, view_color=view_color, texels=texels and texels.replace(kept=result.packing.texels)
+    )

@@ -2,16 +2,15 @@
 the certificate of a bake, which states those due to quantisation."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import chain
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.stages import Coded
 from bitymi_ns.bake.tiles import TileVisibility, weighted_rms, weights
 from bitymi_ns.bundle.statistics import Certificate
-from bitymi_ns.codec.pages import first_texels, listed_texels, listed_tiles
+from bitymi_ns.codec.pages import first_texels, listed_tiles
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters, max_projected_extent
@@ -98,19 +97,18 @@ def _windows(count: int, width: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def certified(baked: BakeState, cameras: Sequence[Camera]) -> BakeState:
+def certified(baked: Coded, cameras: Sequence[Camera]) -> Coded:
     """Certify a bake: measure the error of the stored residual colours against those before quantisation, as training
     views see it, and state it in the statistics; alphas are not covered. A bake without texels, or without a tolerance,
-    is returned as it is. `baked`: encoded, on the CPU."""
+    is returned as it is."""
     scene, options = baked.scene, baked.options
     if baked.atlas is None or options.tolerance == 0:
         return baked
-    stored = listed_texels(torch.from_numpy(baked.atlas.decoded()[..., :3]), baked.packing, baked.mean_residual)
-    before = (baked.texels if baked.uncoded is None else baked.uncoded)[:, :3]
+    difference = baked.shown[:, :3] - baked.texels[:, :3]
+    cameras = [camera.to("cpu") for camera in cameras]
     pixels = closest_pixels(scene.surfels, cameras, options.extent, scene.near) if cameras else None
     opacity, beta = kernel_parameters(scene.surfels, baked.in_front)
     shown = TileVisibility(opacity, beta, baked.extent, scene.weight_bound, pixels=pixels)
-    errors, seen = listed_errors(stored - before, baked.sizes, shown)
-    rms = STEPS * float((stored - before).double().square().mean().sqrt())
-    certificate = Certificate.of(errors[seen], options.tolerance).replace(texel_rms=round(rms, 4))
-    return replace(baked, statistics=baked.statistics.replace(certificate=certificate))
+    errors, seen = listed_errors(difference, baked.sizes, shown)
+    rms = STEPS * float(difference.double().square().mean().sqrt())
+    return baked.stating(certificate=Certificate.of(errors[seen], options.tolerance).replace(texel_rms=round(rms, 4)))

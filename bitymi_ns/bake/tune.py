@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import torch
 from pydantic import NonNegativeInt
 from torch import Tensor
 
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, gain, validation_split
-from bitymi_ns.bake.state import BakeState, encoded_texels
+from bitymi_ns.bake.stages import Coded, Reduced, Rounded, encoded_texels
 from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.pages import first_texels, listed_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
-from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes
+from bitymi_ns.codec.texel_codes import TexelCoder, TexelCodes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
 from bitymi_ns.train.config import TexelSteps
@@ -27,22 +28,26 @@ TO_START = 0.93  # share of the byte limit for coded texels before the last step
 TO_FILL = 0.99  # share of the byte limit that the last steps aim at, where it is to be used up
 
 
+F = TypeVar("F", EncodedAtlas, TexelCodes)
+
+
 @dataclass(frozen=True)
-class Coded:
+class StoredTexels(Generic[F]):
     """Texels as they are stored."""
 
     listed: Tensor  # [T, 3] what was coded
     texels: Tensor  # [T, 3] as they are drawn
-    stored: EncodedAtlas | TexelCodes
+    stored: F
 
 
 class Cosines:
-    """Coder of texels for a compact bundle, within the options' limit of bytes."""
+    """Coder of texels for a compact bundle, within the limit of bytes of its coding."""
 
-    def __init__(self, coder: TexelCoder, options: TexelCodeOptions) -> None:
-        self._coder, self._most, self._fill = coder, options.most_bytes, options.fill
+    def __init__(self, baked: Rounded, weights: Tensor) -> None:
+        self._baked, self._most, self._fill = baked, baked.coding.most_bytes, baked.coding.fill
+        self._coder = TexelCoder(baked.sizes, weights, baked.coding, baked.alpha_codes)
 
-    def first(self, texels: Tensor) -> Coded:
+    def first(self, texels: Tensor) -> StoredTexels[TexelCodes]:
         """Code the initial texels [T, 3]."""
         if self._most is None:
             return self._coded(texels, self._coder.code(texels))
@@ -50,47 +55,55 @@ class Cosines:
             self._coder.aim(self._coder.code(texels), self._most * TO_START)
         return self._coded(texels, self._coder.fit(texels, self._most * TO_START))
 
-    def again(self, texels: Tensor) -> Coded:
+    def again(self, texels: Tensor) -> StoredTexels[TexelCodes]:
         """Code texels between steps, quickly."""
         codes = self._coder.code(texels, rounds=0)
         if self._fill and self._most is not None:
             self._coder.aim(codes, self._most * TO_FILL)
         return self._coded(texels, codes)
 
-    def last(self, coded: Coded) -> Coded:
+    def last(self, best: StoredTexels[TexelCodes]) -> StoredTexels[TexelCodes]:
         """Return the best codes, coded again if they exceed the limit."""
-        if self._most is None or coded.stored.nbytes() <= self._most:
-            return coded
-        return self._coded(coded.listed, self._coder.fit(coded.texels, self._most, rounds=1))
+        if self._most is None or best.stored.nbytes() <= self._most:
+            return best
+        return self._coded(best.listed, self._coder.fit(best.texels, self._most, rounds=1))
 
-    def _coded(self, texels: Tensor, codes: TexelCodes) -> Coded:
-        return Coded(texels.clone(), codes.texels_of(self._coder.blocks), codes)
+    def result(self, last: StoredTexels[TexelCodes]) -> Coded:
+        """Go on to the stage with these texels."""
+        return self._baked.coded(last.stored, last.listed)
+
+    def _coded(self, texels: Tensor, codes: TexelCodes) -> StoredTexels[TexelCodes]:
+        return StoredTexels(texels.clone(), codes.texels_of(self._coder.blocks), codes)
 
 
 class Pages:
     """Encoder of an atlas in the format of the bake's options; the range of values is that of the initial texels."""
 
-    def __init__(self, baked: BakeState) -> None:
+    def __init__(self, baked: Reduced) -> None:
         self._baked, self._range = baked, None
 
-    def first(self, texels: Tensor) -> Coded:
+    def first(self, texels: Tensor) -> StoredTexels[EncodedAtlas]:
         """Encode the initial texels, see `Cosines.first`."""
         self._range = None
         coded = self.again(texels)
         self._range = coded.stored.range
         return coded
 
-    def again(self, texels: Tensor) -> Coded:
+    def again(self, texels: Tensor) -> StoredTexels[EncodedAtlas]:
         """Encode later texels, see `Cosines.again`."""
         baked, packing = self._baked, self._baked.packing
         atlas = encoded_texels(baked.with_alpha(texels), packing, baked.options, value_range=self._range)
         constants = texels[first_texels(baked.sizes)]
         drawn = listed_texels(torch.from_numpy(atlas.decoded()[..., :3]), packing, constants)
-        return Coded(texels.clone(), drawn, atlas)
+        return StoredTexels(texels.clone(), drawn, atlas)
 
-    def last(self, coded: Coded) -> Coded:
+    def last(self, best: StoredTexels[EncodedAtlas]) -> StoredTexels[EncodedAtlas]:
         """Return the best atlas as it is, see `Cosines.last`."""
-        return coded
+        return best
+
+    def result(self, last: StoredTexels[EncodedAtlas]) -> Coded:
+        """Go on to the stage with these texels."""
+        return self._baked.coded(last.stored, self._baked.with_alpha(last.listed))
 
 
 @dataclass
@@ -128,15 +141,13 @@ class TuneOptions(TexelSteps):
 
 
 def tune_atlas(
-    baked: BakeState,
+    baked: Reduced | Rounded,
     views: Sequence[View],
     background: Tensor,
     options: TuneOptions | None = None,
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
-    coding: TexelCodeOptions | None = None,
-    device: torch.device | str = "cpu",
-) -> BakeState:
+) -> Coded:
     """Fine-tune the texels of a bake against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
     A step moves texel t by t <- t - rate g / (m + prior). Here g is the gradient of one view's loss, as a sum over
@@ -146,38 +157,37 @@ def tune_atlas(
     validation views best are kept, or the baked ones if none are better.
 
     Args:
-        baked: a bake with tiles, which keep their sizes; constants of surfels without a tile are tuned, too.
+        baked: a bake with tiles, which keep their sizes; constants of surfels without a tile are tuned, too. Where its
+            surfels are rounded for a compact bundle, the last steps see what its coding makes of the texels, and the
+            codes that show the validation views best are kept.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene.
         eval_views: held-out views on which the gain of the stored texels is measured; they decide nothing.
-        coding: how texels are coded, where the surfels are rounded for a compact bundle. The last steps then see what
-            the coding makes of the texels, and the codes that show the validation views best are kept.
-        device: where the texels learn. Photographs and cameras may be on another one: each view is copied when it is
-            traced.
+
+    Photographs and cameras may be on another device than the work: each view is copied when it is traced.
 
     Returns:
-        a new bake, encoded, with `statistics.finetune`; the texels stay as they are if there are fewer than
+        the bake with coded texels and `statistics.finetune`; the texels stay as they are if there are fewer than
         `FEWEST_VIEWS` views (without validation, none).
     """
     options = options or TuneOptions()
     options.check()
     if len(views) < (FEWEST_VIEWS if options.val_every else 1):
-        return replace(baked, statistics=baked.statistics.replace(finetune=FineTuning(steps=0, views=len(views))))
+        return baked.encoded(progress).stating(finetune=FineTuning(steps=0, views=len(views)))
     started, cpu_started = time.perf_counter(), time.process_time()
-    texels = TexelList(baked, device)
+    texels = TexelList(baked)
     budget = MemoryBudget(options.cache_bytes)
     held_back, trained = validation_split(views, options.val_every)
     validation, tuned = (TuningViews(texels, part, background, budget) for part in (held_back, trained))
     before = validation.psnr(texels.values, progress)  # before others: the cache is filled in this order
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)
-    covered = texels.coverage(trained, progress) if baked.coverage is None else baked.coverage.to(device)
+    if isinstance(baked, Rounded):
+        covered, coder = baked.coverage.to(baked.device), Cosines(baked, baked.coverage[:, 1])
+    else:
+        covered, coder = texels.coverage(trained, progress), Pages(baked)
     share = 1.0 / (covered[:, 0] + options.prior)  # [T]
     _descend(texels.values.clone(), tuned, validation, share, stopping, options, progress)
     held_out = TuningViews(texels, eval_views, background, MemoryBudget(0))
-    coder: Cosines | Pages = Pages(baked)
-    if baked.codes is not None:
-        coding = coding or TexelCodeOptions()
-        coder = Cosines(TexelCoder(baked.sizes, covered[:, 1].cpu(), coding, baked.alpha_codes), coding)
     untuned = held_out.psnr(coder.first(texels.values.cpu()).texels) if eval_views else None
     coded = _coded(tuned, validation, share, stopping.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
@@ -186,11 +196,7 @@ def tune_atlas(
         steps_asked=options.steps + options.coded_steps,
         psnr_held_out=None if untuned is None else gain(untuned, held_out.psnr(coded.texels)),
     )
-    if isinstance(coded.stored, TexelCodes):
-        result = baked.with_texel_codes(coded.stored, coded.listed)
-    else:
-        result = baked.with_texels(coded.listed).with_atlas(coded.stored)
-    return replace(result, statistics=result.statistics.replace(finetune=statistics))
+    return coder.result(coded).stating(finetune=statistics)
 
 
 def _descend(
@@ -220,7 +226,7 @@ def _coded(
     coding: Cosines | Pages,
     options: TuneOptions,
     progress: Progress,
-) -> Coded:
+) -> StoredTexels:
     """Optimise texels [T, 3] through their coding: the image is that of the stored texels, and its gradient moves the
     uncoded ones. Return the coded texels that show the validation views best."""
     coded = coding.first(texels.cpu())

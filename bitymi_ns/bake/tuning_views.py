@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.early_stopping import evaluate
-from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.stages import Stage
 from bitymi_ns.ops import (
     Fragments,
     Projection,
@@ -37,17 +37,11 @@ class TexelList:
         alpha: opacities of the texels on the device, which are not tuned; None = opaque texels.
     """
 
-    def __init__(self, baked: BakeState, device: torch.device | str = "cpu") -> None:
-        """
-        Args:
-            baked: with an atlas.
-
-        Raises:
-            ValueError: there is no atlas.
-        """
+    def __init__(self, baked: Stage) -> None:
+        """Raises ValueError: no surfel has a tile."""
         if not baked.textured:
             raise ValueError("a scene without texture has no texels to tune")
-        self.device = torch.device(device)
+        self.device = device = baked.device
         self.scene = baked.scene.to(device)
         self.tiles = TexelTiles.of_sizes(baked.sizes.clamp(min=1).to(device), baked.extent.float().to(device))
         self.values = baked.texels[:, :3].contiguous().to(device, copy=True)
@@ -77,6 +71,7 @@ LEAST_KEPT = 1 / 8
 class TuningView:
     """A photograph and its traced view: the fragments with texels, and the render of everything else."""
 
+    projection: Projection  # of the surfels into the first view: blending reads of it only the unused beta channel
     lists: list[Fragments]  # the fragments that show a texel, in bands from top to bottom
     base: Tensor  # [N, 3] f_view of every surfel
     rest: Tensor  # [H, W, 3] the picture without these fragments: the faint ones, and the background
@@ -104,7 +99,7 @@ class TuningViews(Sequence[TuningView]):
         self._background = background.to(texels.device)
         self._kept: dict[int, TuningView] = {}
         self._keeps: bool | None = None  # whether any; not known before the first one
-        self._projection: Projection | None = None
+        self._projection: Projection | None = None  # of the first view
 
     def __len__(self) -> int:
         return len(self._views)
@@ -122,7 +117,6 @@ class TuningViews(Sequence[TuningView]):
     @torch.no_grad()
     def _traced(self, view: View) -> TuningView:
         scene, projection = self._texels.scene, self._texels.projection(view.camera)
-        # The first view's projection serves all: blending reads it for the beta channel only, which is unused.
         self._projection = self._projection or projection
         p, camera = scene.surfels, projection.camera
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
@@ -136,6 +130,7 @@ class TuningViews(Sequence[TuningView]):
         behind = torch.cat(rest) + (1 - covered) * self._background
         device = self._texels.device
         return TuningView(
+            self._projection,
             lists,
             base,
             behind.view(*size, 3),
@@ -156,8 +151,7 @@ class TuningViews(Sequence[TuningView]):
     def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
         """Render a view with texels, and apply its photograph's correction: [H, W, 3]. `view`: of this sequence.
         `texels`: [T, 3], as the baked renderer shows them before any quantisation."""
-        assert self._projection is not None
-        drawn = (self._projection, view.base, texels, self._texels.tiles)
+        drawn = (view.projection, view.base, texels, self._texels.tiles)
         rgb = torch.cat([blended_image(part, *drawn, descent=descent)[:, :3] for part in view.lists])
         rgb = rgb.view_as(view.rest) + view.rest
         return rgb if view.alpha is None else shown(rgb, view.correction, view.alpha, self._background)

@@ -32,11 +32,9 @@ from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, 
 from bitymi_ns.bundle.surfel_table import TERMS, from_columns
 from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
 from bitymi_ns.codec.limits import ALPHA_LIMIT, RESIDUAL_LIMIT
-from bitymi_ns.codec.packing import Packing
-from bitymi_ns.codec.pages import paged_texels
-from bitymi_ns.codec.quantise import Range, alpha_bytes, decode_pages
+from bitymi_ns.codec.quantise import Range, byte_pages, decode_pages
 from bitymi_ns.codec.streams import StreamError
-from bitymi_ns.codec.texel_codes import TexelCodes, constants, mean_alphas_of
+from bitymi_ns.codec.texel_codes import constants, mean_alphas_of
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedOutput, BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -267,7 +265,7 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
             packing = compact.packing_of(atlas, sizes)
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
             found = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]), alpha)
-            texels = _byte_pages(found, packing, Range(atlas.offset, atlas.scale, ""))
+            texels = byte_pages(found.decoded(), packing, Range(atlas.offset, atlas.scale, ""))
             if not decode and texels.numel() >= LARGE_ATLAS:
                 blocks = _encode_blocks(texels, info.has_alpha)
                 texels = texels if blocks is None else None
@@ -284,23 +282,6 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
         "mean_residual": constants(residual, step),
         "mean_alpha": None if alpha is None else mean_alphas_of(alpha),
     }
-
-
-def _byte_pages(codes: TexelCodes, packing: Packing, value_range: Range) -> Tensor:
-    """Decode texels to pages [layers, height, width, 4] uint8. Texels are rounded before they are laid out, so
-    that each moves as one int32."""
-
-    def whole(colors: np.ndarray, alphas: np.ndarray | None) -> np.ndarray:
-        rgba = np.full((len(colors), 4), 255, dtype=np.uint8)
-        rgba[:, :3] = value_range.to_unorm8(colors)
-        if alphas is not None:
-            rgba[:, 3] = alpha_bytes(alphas)
-        return rgba.view(np.int32)[:, 0]
-
-    alphas, zeros = codes.alphas(), np.zeros((1, 3), dtype=np.float32)
-    listed = torch.from_numpy(whole(codes.texels().numpy(), None if alphas is None else alphas.numpy()))
-    nothing = int(whole(zeros, None if alphas is None else zeros[:, 0])[0])
-    return paged_texels(listed, packing, nothing)[..., None].view(torch.uint8)
 
 
 def _encode_blocks(texels: Tensor, alpha: bool) -> Tensor | None:

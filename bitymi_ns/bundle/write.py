@@ -34,7 +34,7 @@ from bitymi_ns.bundle.read import Bundle, read_bundle, read_manifest
 from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_fault, term_columns, to_columns
 from bitymi_ns.bundle.world import World, same_frame
 from bitymi_ns.codec.limits import ALPHA_LIMIT
-from bitymi_ns.codec.quantise import EncodedAtlas
+from bitymi_ns.codec.quantise import Atlas, EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
 from bitymi_ns.files import complete_folder, reason, size_text
 from bitymi_ns.ops.view_color import check_lean
@@ -48,7 +48,7 @@ _CHUNK = 1 << 22
 def write_bundle(
     folder: str | Path,
     scene: BakedScene,
-    atlas: EncodedAtlas | None = None,
+    atlas: Atlas | None = None,
     codes: SceneCodes | None = None,
     *,
     background: Sequence[float] = (0.0, 0.0, 0.0),
@@ -65,7 +65,7 @@ def write_bundle(
     Args:
         scene: on the CPU, all numbers finite; its own atlas is ignored. Mean residuals are also added to the colour
             that other viewers show. Mean alphas are required by, and written with, an atlas with alphas.
-        atlas: encoded atlas; None for a scene without texture.
+        atlas: of the texels, an `EncodedAtlas` where there are no codes; None for a scene without texture.
         codes: codes of surfels and texels, for a compact bundle; scene and atlas must be decoded from them.
         background: colour behind the surfels.
         world: frame of the scene.
@@ -100,7 +100,7 @@ def write_bundle(
                 comments = [GENERATOR, "2D Beta surfels; see bundle.json"]
                 terms = {TERMS: term_columns(surfels)} if "view_terms" in surfels else None
                 ply.write_ply(new / SURFELS, to_columns(scene, _has_alpha(atlas)), comments, terms)
-            if codes is None and atlas is not None:
+            if codes is None and isinstance(atlas, EncodedAtlas):
                 ktx2.write_ktx2(new / ATLAS, atlas.payload, atlas.format, atlas.width, atlas.height, GENERATOR)
             for name, data in parts.items():
                 (new / name).write_bytes(data)
@@ -125,7 +125,8 @@ def write_bundle(
                 warnings.warn(f"{kept}: check its views, notes and crops, or remove it", stacklevel=2)
         return bundle
     except OSError as error:
-        size = sum(value.numel() * 4 for value in surfels.values()) + (atlas.nbytes if atlas else 0)
+        size = sum(map(len, parts.values())) or sum(value.numel() * 4 for value in surfels.values())
+        size += atlas.nbytes if isinstance(atlas, EncodedAtlas) else 0
         needs = f" (it needs about {size_text(size)})" if error.errno in (errno.ENOSPC, errno.EDQUOT) else ""
         why = reason(error, folder)
         raise BundleError(f"{folder} cannot be written{needs}: {why}. Nothing was left behind") from error
@@ -153,7 +154,7 @@ def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
 
 def _describe(
     scene: BakedScene,
-    atlas: EncodedAtlas | None,
+    atlas: Atlas | None,
     background: Sequence[float],
     world: World,
     statistics: Mapping[str, Any] | None,
@@ -192,7 +193,7 @@ def _describe(
             "format": atlas.format,
             "width": atlas.width,
             "height": atlas.height,
-            "layers": len(atlas.payload),
+            "layers": atlas.layers,
             "extent_column": EXTENT_COLUMN,
             "offset": atlas.range.offset,
             "scale": atlas.range.scale,
@@ -205,11 +206,11 @@ def _describe(
     return described
 
 
-def _has_alpha(atlas: EncodedAtlas | None) -> bool:
+def _has_alpha(atlas: Atlas | None) -> bool:
     return atlas is not None and atlas.alpha_scale > 0
 
 
-def _check_alpha(scene: BakedScene, atlas: EncodedAtlas | None, codes: SceneCodes | None) -> None:
+def _check_alpha(scene: BakedScene, atlas: Atlas | None, codes: SceneCodes | None) -> None:
     """Check that atlas and codes agree on having alphas, and that an atlas with alphas has mean alphas in range."""
     if codes is not None and codes.texels is not None and (codes.alpha is not None) != _has_alpha(atlas):
         raise BundleError("the atlas and the codes of the texels disagree whether there are alphas")

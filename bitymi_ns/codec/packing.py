@@ -26,6 +26,12 @@ class Packing:
         """Texels of all tiles."""
         return int(self.tiles[:, 3:].astype(np.int64).prod(axis=1).sum())
 
+    @property
+    def of_tiles(self) -> npt.NDArray[np.bool_]:
+        """[T] whether a texel of the list (`pages.py`) belongs to a tile; the others are constants."""
+        sides = self.tiles[:, 3:].astype(np.int64)
+        return np.repeat(sides[:, 0] > 0, sides.clip(min=1).prod(axis=1))
+
 
 def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192, max_layers: int = 2048) -> Packing:
     """Pack tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).

@@ -16,6 +16,11 @@ from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 
 
+def joined(colors: Tensor, alphas: Tensor | None) -> Tensor:
+    """Join residual colours [n, 3] and alphas [n], if any, to texels [n, C]."""
+    return colors if alphas is None else torch.cat([colors, alphas[:, None]], 1)
+
+
 def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
     """Group surfels by tile size (r_u, r_v), given as [N, 2]. Returns list of (r_u, r_v, rows [M] int64), sizes
     ascending, without surfels that have no tile."""

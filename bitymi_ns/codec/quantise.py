@@ -8,11 +8,13 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+import torch
+from torch import Tensor
 
 from bitymi_ns.codec.bc7_encode import STRIP, Profile, bc7_encoder
 from bitymi_ns.codec.limits import ALPHA_LIMIT, ALPHA_ONE, ALPHA_SCALE, RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing
-from bitymi_ns.codec.pages import covered_blocks
+from bitymi_ns.codec.pages import covered_blocks, paged_texels
 from bitymi_ns.ops.baked_scene import decode_bc7
 from bitymi_ns.progress import Progress, no_progress
 
@@ -43,35 +45,48 @@ class Range:
 
 
 @dataclass(frozen=True)
-class EncodedAtlas:
-    """An atlas in its stored format."""
+class Atlas:
+    """Format of an atlas, and the error of its quantisation."""
 
-    payload: list[bytes]  # one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top
     format: Format  # one of bc7, uint8, fp16
     # width, height: page size in texels
     width: int
     height: int
+    layers: int  # number of pages
     range: Range  # quantisation range (offset 0 and scale 1 for fp16)
     encoder: str  # name of the encoder and its profile
     clipped_fraction: float  # share of the tiles' colour values outside the range
     mse: float  # mean squared error of the decoded tiles' colours against the atlas, colour units squared
-    alpha_scale: float = 0.0  # alpha = alpha_scale * value, as in `BakedScene`; 0 = opaque texels
+    alpha_scale: float  # alpha = alpha_scale * value, as in `BakedScene`; 0 = opaque texels
 
     @property
     def psnr(self) -> float | None:
         """PSNR in dB of the decoded tiles' colours against the atlas, peak 1; None if they are equal."""
         return None if self.mse == 0 else float(-10.0 * np.log10(self.mse))
 
+    def values(self, pages: np.ndarray) -> npt.NDArray[np.float32]:
+        """Dequantise stored texels [..., 4] to [..., C]: residual colours and, if stored, alphas."""
+        return _values(pages, self.format, self.range, self.alpha_scale)
+
+
+@dataclass(frozen=True)
+class EncodedAtlas(Atlas):
+    """An atlas in its stored format."""
+
+    payload: list[bytes]  # one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top
+
     @property
     def nbytes(self) -> int:
         """Bytes of the texels."""
         return sum(len(page) for page in self.payload)
 
+    def pages(self) -> Tensor:
+        """Decode to stored texels as `decode_pages`."""
+        return torch.from_numpy(decode_pages(self.payload, self.format, self.width, self.height))
+
     def decoded(self) -> npt.NDArray[np.float32]:
         """Decode to [layers, height, width, C]: residual colours and, if stored, alphas."""
-        return decode(
-            self.payload, self.format, self.width, self.height, self.range.offset, self.range.scale, self.alpha_scale
-        )
+        return self.values(self.pages().numpy())
 
 
 def choose_range(
@@ -139,14 +154,8 @@ def encode(
         rgba = _quantised(values, format, value_range)
         data = encoder(rgba) if encoder else rgba.tobytes()
         decoded = decode([data], format, width, len(values), value_range.offset, value_range.scale)[0]
-        inside = values[mask, :3]
-        if format == "fp16":
-            low, high = -RESIDUAL_LIMIT, RESIDUAL_LIMIT
-        else:
-            low, high = value_range.offset, value_range.offset + value_range.scale
-        slack = 1e-6 * (high - low)  # the extremes may round to float32 just outside
-        clipped = int(((inside < low - slack) | (inside > high + slack)).sum())
-        return data, clipped, float(np.square(decoded[mask].astype(np.float64) - inside).sum())
+        whole = Range(-RESIDUAL_LIMIT, 2 * RESIDUAL_LIMIT, "none")
+        return data, *_errors(values[mask, :3], decoded[mask], whole if format == "fp16" else value_range)
 
     strips = [(layer, top) for layer in range(layers) for top in range(0, height, STRIP)]
     pages: list[list[bytes]] = [[] for _ in texels]
@@ -163,12 +172,48 @@ def encode(
         format=format,
         width=width,
         height=height,
+        layers=layers,
         range=value_range,
         encoder=f"ispc_texcomp {profile}" if format == "bc7" else f"{format} rounding",
         clipped_fraction=clipped / values,
         mse=squares / values,
         alpha_scale=alpha_scale,
     )
+
+
+def round_to_bytes(texels: Tensor, packing: Packing, value_range: Range) -> tuple[Atlas, Tensor]:
+    """Round decoded texels [T, C] of a compact bundle, listed as in `pages.py`, as its readers do: the atlas, and its
+    `byte_pages`."""
+    colors = texels.numpy()[packing.of_tiles, :3]
+    clipped, squares = _errors(colors, value_range.from_unorm8(value_range.to_unorm8(colors)), value_range)
+    atlas = Atlas(
+        format="uint8",
+        width=packing.width,
+        height=packing.height,
+        layers=packing.layers,
+        range=value_range,
+        encoder="cosine transform",
+        clipped_fraction=clipped / max(1, colors.size),
+        mse=squares / max(1, colors.size),
+        alpha_scale=ALPHA_SCALE if texels.shape[1] == 4 else 0.0,
+    )
+    return atlas, byte_pages(texels, packing, value_range)
+
+
+def byte_pages(texels: Tensor, packing: Packing, value_range: Range) -> Tensor:
+    """Round listed texels [T, C] and lay them out as pages [layers, height, width, 4] uint8. They are rounded first, so
+    that each moves as one int32."""
+    zero = torch.zeros(1, texels.shape[1])
+    listed, nothing = (torch.from_numpy(_quantised(each.numpy(), "uint8", value_range)) for each in (texels, zero))
+    return paged_texels(listed.view(torch.int32), packing, int(nothing.view(torch.int32))).view(torch.uint8)
+
+
+def _errors(values: npt.NDArray[np.float32], decoded: npt.NDArray[np.float32], value_range: Range) -> tuple[int, float]:
+    """Count colour values outside the range, and sum the squares of the errors of the decoded ones."""
+    low, high = value_range.offset, value_range.offset + value_range.scale
+    slack = 1e-6 * (high - low)  # the extremes may round to float32 just outside
+    clipped = int(((values < low - slack) | (values > high + slack)).sum())
+    return clipped, float(np.square(decoded.astype(np.float64) - values).sum())
 
 
 def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: int) -> np.ndarray:
@@ -198,31 +243,31 @@ def decode(
 ) -> npt.NDArray[np.float32]:
     """Decode an atlas to texels [layers, height, width, C] float32: colours offset + scale * stored value, and alphas
     if `alpha_scale` is not 0."""
-    stored = decode_pages(payload, format, width, height)[..., : 4 if alpha_scale else 3]
+    pages = decode_pages(payload, format, width, height)
+    return _values(pages, format, Range(offset, scale, "none"), alpha_scale)
+
+
+def _values(pages: np.ndarray, format: Format, value_range: Range, alpha_scale: float) -> npt.NDArray[np.float32]:
+    stored = pages[..., : 4 if alpha_scale else 3]
     if format == "fp16":
         return stored.astype(np.float32)
-    values = Range(offset, scale, "none").from_unorm8(stored)
+    values = value_range.from_unorm8(stored)
     if alpha_scale:
         values[..., 3] = stored[..., 3] * np.float32(alpha_scale / 255.0)
     return values
 
 
-def alpha_bytes(alpha: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-    """Quantise alphas to the nearest byte, 128 = 1, clipped to 0 to 255."""
-    return np.rint(np.clip(alpha * np.float32(ALPHA_ONE), 0.0, 255.0)).astype(np.uint8)
-
-
 def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Range) -> np.ndarray:
-    """Quantise to RGBA texels [h, w, 4], uint8 or little-endian float16; opaque texels get full alpha."""
-    alpha = values[..., 3] if values.shape[2] == 4 else None
+    """Quantise to RGBA texels [..., 4], uint8 or little-endian float16; opaque texels get full alpha."""
+    alpha = values[..., 3] if values.shape[-1] == 4 else None
     if format == "fp16":
-        rgba = np.ones((*values.shape[:2], 4), dtype="<f2")
+        rgba = np.ones((*values.shape[:-1], 4), dtype="<f2")
         rgba[..., :3] = np.clip(values[..., :3], -RESIDUAL_LIMIT, RESIDUAL_LIMIT)
         if alpha is not None:
             rgba[..., 3] = np.clip(alpha, 0.0, ALPHA_LIMIT)
         return rgba
-    rgba = np.full((*values.shape[:2], 4), 255, dtype=np.uint8)
+    rgba = np.full((*values.shape[:-1], 4), 255, dtype=np.uint8)
     rgba[..., :3] = value_range.to_unorm8(values[..., :3])
     if alpha is not None:
-        rgba[..., 3] = alpha_bytes(alpha)
+        rgba[..., 3] = np.rint(np.clip(alpha * np.float32(ALPHA_ONE), 0.0, 255.0))  # 128 = 1
     return rgba

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.limits import ALPHA_ONE, RESIDUAL_LIMIT
-from bitymi_ns.codec.pages import first_texels, size_classes
+from bitymi_ns.codec.pages import first_texels, joined, size_classes
 from bitymi_ns.codec.surfel_codes import SurfelCodes
 from bitymi_ns.ops import backend
 
@@ -157,6 +157,15 @@ class TexelCodes:
         """Decode as `texels`, given the tiles' blocks."""
         return _decode(self.constants, self.coefficients, blocks, self.sizes, _steps(self.step, self.grades))
 
+    def decoded(self) -> Tensor:
+        """Decode to [T, C]: residual colours and, if there are any, alphas."""
+        return joined(self.texels(), self.alphas())
+
+    @property
+    def means(self) -> Tensor:
+        """[N, C] mean residuals and, if there are any, mean alphas."""
+        return joined(self.constants, None if self.alpha is None else self.alpha.means)
+
     def alphas(self) -> Tensor | None:
         """Decode the alphas [T], in the same order; None if opaque."""
         return None if self.alpha is None else self.alpha.values(self.sizes, self.grades)
@@ -191,7 +200,7 @@ class SceneCodes:
     """Surfels and texels of a compact bundle as integers."""
 
     surfels: SurfelCodes  # of N surfels
-    texels: TexelCodes | None  # None without tiles, or before coding
+    texels: TexelCodes | None  # None without tiles
     residual: npt.NDArray[np.int64]  # [N, 3] int64 mean residuals: green, red - green, blue - green
     residual_step: float  # colour units
     # page_width, page_rows: arguments of `packing.pack`

@@ -54,7 +54,7 @@ def test_bakes_show_what_was_trained(trained) -> None:
     assert psnr(rgb(opaque, camera), want) < 25  # alpha decides the picture
     smaller = prune_and_resample(baked, [camera])
     assert psnr(rgb(smaller.unquantised(), camera), want) > 45
-    assert psnr(rgb(smaller.encoded().stored(), camera), want) > 35
+    assert psnr(rgb(smaller.encoded().scene, camera), want) > 35
 
 
 def test_a_compact_bundle_keeps_the_alphas_that_its_colours_were_tuned_over(trained, tmp_path: Path) -> None:
@@ -64,11 +64,11 @@ def test_a_compact_bundle_keeps_the_alphas_that_its_colours_were_tuned_over(trai
     tune = replace(TuneOptions.of_learned(20), coded_every=5)
     compact = Compact(share=0.5, views=1)
     baked = bake(scene, [camera], views, torch.zeros(3), BakeOptions(), RefineOptions(tune=tune, compact=compact))
-    assert torch.equal(baked.codes.texels.alphas(), baked.alpha_codes.alphas())
+    assert torch.equal(baked.codes.texels.alphas(), baked.texels[:, 3])
     export(baked, folder := tmp_path / "b")
     bundle, checks = check_files(folder)
     assert all(check.ok for check in checks), checks
     assert bundle.info.version == "6.0"
     shown = read_bundle(folder).scene
-    torch.testing.assert_close(rgb(shown, camera), rgb(baked.stored(), camera), rtol=0, atol=1e-6)
+    torch.testing.assert_close(rgb(shown, camera), rgb(baked.scene, camera), rtol=0, atol=1e-6)
     assert psnr(rgb(shown, camera), want) > 38

@@ -10,14 +10,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bake import BakeOptions, BakeState, RefineOptions, TuneOptions, bake, bake_field, export
+from bitymi_ns.bake import BakeOptions, Coded, Reduced, RefineOptions, TuneOptions, bake, bake_field, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.tile_errors import cells_per_pixel, closest_pixels, listed_errors, moving_average
 from bitymi_ns.bake.tiles import TileVisibility
 from bitymi_ns.bundle import check_files
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.scene.visibility import visibility
-from tests.bake.test_tune import BACKGROUND, photographs, waving
+from tests.bake.test_tune import BACKGROUND, photographs, waving_reduced
 from tests.bundle.damage import amend, recode
 
 SIDES = ((0, 0), (4, 4), (8, 4), (8, 16))
@@ -110,12 +110,12 @@ def test_the_counts_are_true(seed: int, size: float) -> None:
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> BakeState:
-    return waving(scene(60))
+def truth(scene) -> Reduced:
+    return waving_reduced(scene(60))
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["compact", "pages"])
-def tuned(scene, truth: BakeState, request: pytest.FixtureRequest) -> BakeState:
+def tuned(scene, truth: Reduced, request: pytest.FixtureRequest) -> Coded:
     compact, made, views = request.param, scene(60), photographs(truth)
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0
@@ -125,7 +125,7 @@ def tuned(scene, truth: BakeState, request: pytest.FixtureRequest) -> BakeState:
 
 
 def test_what_is_stated_is_true_and_other_integers_fail_behind_a_good_hash(
-    tuned: BakeState, truth: BakeState, tmp_path: Path
+    tuned: Coded, truth: Reduced, tmp_path: Path
 ) -> None:
     baked = tuned
     stated = baked.statistics.certificate
@@ -144,7 +144,7 @@ def test_what_is_stated_is_true_and_other_integers_fail_behind_a_good_hash(
         assert [check.name for check in check_files(tmp_path / "b")[1] if not check.ok] == ["decoder"]
 
 
-def test_counts_that_contradict_each_other_fail(tuned: BakeState, tmp_path: Path) -> None:
+def test_counts_that_contradict_each_other_fail(tuned: Coded, tmp_path: Path) -> None:
     export(tuned, tmp_path / "b")
     amend(tmp_path / "b", lambda info: info["statistics"]["certificate"].update(beyond=0, worst=2.0))
     assert [check.name for check in check_files(tmp_path / "b")[1] if not check.ok] == ["certificate"]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeState, TuneOptions, compact, export, tune_atlas
+from bitymi_ns.bake import Coded, Reduced, Rounded, Stage, TuneOptions, compact, export, tune_atlas
 from bitymi_ns.bake.compact import (
     ENOUGH,
     MAX_LAMBDA,
@@ -19,88 +19,88 @@ from bitymi_ns.bake.compact import (
     Compact,
     choose,
     compacted,
-    with_coded_texels,
 )
 from bitymi_ns.bake.precision import PER_BIT
 from bitymi_ns.bundle import check_files
 from bitymi_ns.codec.texel_codes import TexelCodeOptions
 from bitymi_ns.train.views import View
-from tests.bake.test_tune import BACKGROUND, photographs, render, waving
+from tests.bake.test_tune import BACKGROUND, photographs, render, waving_reduced
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> BakeState:
+def truth(scene) -> Reduced:
     """The scene in the photographs."""
-    return waving(scene(60))
+    return waving_reduced(scene(60))
 
 
 @pytest.fixture(scope="module")
-def views(truth: BakeState) -> list[View]:
+def views(truth: Reduced) -> list[View]:
     """Photographs of `truth`, darker by 0.01, for a nonzero error."""
     return [View(view.camera, (view.image - 0.01).clamp(0, 1)) for view in photographs(truth)]
 
 
 @pytest.fixture(scope="module")
-def rounded(truth: BakeState, views: list[View]) -> BakeState:
-    return compacted(truth, views, BACKGROUND, Compact(share=0.05))[0]
+def rounded(truth: Reduced, views: list[View]) -> Rounded:
+    return compacted(truth, views, BACKGROUND, Compact(share=0.05))
 
 
-def error(a: BakeState, b: BakeState, views: list[View]) -> float:
+def error(a: Stage, b: Stage, views: list[View]) -> float:
     """Compute the mean squared difference of renders."""
     pictures = [(render(a, view.camera), render(b, view.camera)) for view in views]
     return sum(float((x.clamp(0, 1) - y.clamp(0, 1)).square().mean()) for x, y in pictures) / len(pictures)
 
 
-def from_photographs(baked: BakeState, views: list[View]) -> float:
+def from_photographs(baked: Stage, views: list[View]) -> float:
     """Compute the mean squared difference from the photographs."""
     pictures = [(render(baked, view.camera).clamp(0, 1), view.image) for view in views]
     return sum(float((x - y).square().mean()) for x, y in pictures) / len(pictures)
 
 
 def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
-    truth: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch
+    truth: Reduced, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(compact, "MAX_LAMBDA", math.inf)  # the share alone decides
     sizes = []
     for share in (0.05, 0.4):
-        rounded, coding = compacted(truth, views, BACKGROUND, Compact(share=share, views=len(views)))
+        rounded = compacted(truth, views, BACKGROUND, Compact(share=share, views=len(views)))
         allowed = share * from_photographs(truth, views)
         assert 0 < rounded.statistics.rounding.mse <= 1.001 * allowed
         assert error(truth, rounded, views) < 4 * allowed
         assert sorted(rounded.rows.tolist()) == sorted(truth.rows.tolist())
-        sizes.append(rounded.codes.surfels.nbytes() + with_coded_texels(rounded, coding).codes.texels.nbytes())
+        sizes.append(rounded.codes.nbytes() + rounded.encoded().codes.texels.nbytes())
     assert sizes[1] < 0.9 * sizes[0]
 
 
-def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: BakeState, views: list[View]) -> None:
+def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: Reduced, views: list[View]) -> None:
     dark = [View(view.camera, view.image / 2) for view in views]
-    capped, coding = compacted(truth, dark, BACKGROUND, Compact(share=0.9))
-    assert coding.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MAX_LAMBDA / PER_BIT))
-    assert coding.step == pytest.approx(4.16, abs=0.02)
-    asked, wider = compacted(truth, dark, BACKGROUND, Compact(psnr=Coder(truth, dark, BACKGROUND, Compact()).psnr - 2))
-    assert wider.step > coding.step and asked.codes.surfels.nbytes() < capped.codes.surfels.nbytes()
+    capped = compacted(truth, dark, BACKGROUND, Compact(share=0.9))
+    assert capped.coding.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MAX_LAMBDA / PER_BIT))
+    assert capped.coding.step == pytest.approx(4.16, abs=0.02)
+    asked = compacted(truth, dark, BACKGROUND, Compact(psnr=Coder(truth, dark, BACKGROUND, Compact()).psnr - 2))
+    assert asked.coding.step > capped.coding.step and asked.codes.nbytes() < capped.codes.nbytes()
 
 
-def test_the_pictures_are_as_good_as_is_asked_for(truth: BakeState, views: list[View]) -> None:
+def test_the_pictures_are_as_good_as_is_asked_for(truth: Reduced, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact())
     sizes = []
     for loss in (0.1, 1.0):
-        rounded, _ = compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr - loss))
+        rounded = compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr - loss))
         assert rounded.statistics.rounding.mse <= coder.error * (10 ** (loss / 10) - 1) * 1.1
-        sizes.append(rounded.codes.surfels.nbytes())
+        sizes.append(rounded.codes.nbytes())
     assert sizes[1] < sizes[0]
     with pytest.raises(ValueError, match="cannot be reached: ask for less"):
         compacted(truth, views, BACKGROUND, Compact(psnr=coder.psnr + 1))
 
 
-def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: BakeState, views: list[View], tmp_path: Path) -> None:
-    free, coding = compacted(truth, views, BACKGROUND, Compact(share=0.02))
-    most = (free.codes.surfels.nbytes() + with_coded_texels(free, coding).codes.texels.nbytes()) * 7 // 10
-    fitted, coding = compacted(truth, views, BACKGROUND, Compact(most_bytes=most))
-    assert coding.fill and fitted.codes.surfels.nbytes() < free.codes.surfels.nbytes()
+def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Reduced, views: list[View], tmp_path: Path) -> None:
+    free = compacted(truth, views, BACKGROUND, Compact(share=0.02))
+    most = (free.codes.nbytes() + free.encoded().codes.texels.nbytes()) * 7 // 10
+    fitted = compacted(truth, views, BACKGROUND, Compact(most_bytes=most))
+    assert fitted.coding.fill and fitted.codes.nbytes() < free.codes.nbytes()
     for fill in (True, False):
         options = TuneOptions(steps=0, coded_steps=60, val_every=0)
-        tuned = tune_atlas(fitted, views, BACKGROUND, options, coding=replace(coding, fill=fill))
+        again = replace(fitted, coding=replace(fitted.coding, fill=fill))
+        tuned = tune_atlas(again, views, BACKGROUND, options)
         export(tuned, bundle := tmp_path / f"fill-{fill}")
         size = sum((bundle / name).stat().st_size for name in ("surfels.bin", "texels.bin"))
         assert size == tuned.codes.surfels.nbytes() + tuned.codes.texels.nbytes()
@@ -110,48 +110,48 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: BakeState, views
 
 
 def test_a_size_that_the_coarsest_texels_exceed_is_refused() -> None:
-    surfels = SimpleNamespace(nbytes=lambda: 1000)
-    baked = SimpleNamespace(rows=range(60), codes=SimpleNamespace(surfels=surfels))
-    point = SimpleNamespace(bytes=5000, error=0.1, baked=baked, coding=None)
+    baked = SimpleNamespace(rows=range(60), codes=SimpleNamespace(nbytes=lambda: 1000))
+    point = SimpleNamespace(bytes=5000, error=0.1, baked=baked)
     coder: Any = SimpleNamespace(measured=True, allowed=lambda share: 0.01, at=lambda lmbda: point)
     with pytest.raises(ValueError, match=r"3,000 bytes are too few for 60 surfels, which take at least 5,000"):
         choose(coder, Compact(most_bytes=3000))
 
 
-def test_bytes_that_buy_nothing_are_not_spent(truth: BakeState, views: list[View]) -> None:
+def test_bytes_that_buy_nothing_are_not_spent(truth: Reduced, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact(views=len(views)))
-    kept, coding = choose(coder, Compact(most_bytes=10**9))
+    kept = choose(coder, Compact(most_bytes=10**9))
     fewer, more = kept.statistics.rounding.alternatives
     assert 0.45 < fewer[0] < 0.55 and 1.8 < more[0] < 2.2 and fewer[1] < more[1]
     assert kept.statistics.rounding.mse <= 1.001 * ENOUGH * coder.error
-    size = kept.codes.surfels.nbytes() + with_coded_texels(kept, coding).codes.texels.nbytes()
+    size = kept.codes.nbytes() + kept.encoded().codes.texels.nbytes()
     assert size < 0.8 * coder.at(START / 1000).bytes
-    assert coding.most_bytes == 10**9 - kept.codes.surfels.nbytes()
+    assert kept.coding.most_bytes == 10**9 - kept.codes.nbytes()
 
 
-def test_without_views_the_reference_steps_are_taken(truth: BakeState) -> None:
-    plain, _ = compacted(truth, [], BACKGROUND)
+def test_without_views_the_reference_steps_are_taken(truth: Reduced) -> None:
+    plain = compacted(truth, [], BACKGROUND)
     assert plain.statistics.rounding.mse is None and plain.statistics.rounding.alternatives is None
     assert len(plain.rows) == len(truth.rows) and len(plain.scene.surfels["view_terms"]) > 0
 
 
 def test_texels_learn_through_their_coding_and_are_what_is_stored(
-    rounded: BakeState, views: list[View], tmp_path
+    rounded: Rounded, views: list[View], tmp_path
 ) -> None:
     options = TuneOptions(steps=8, coded_steps=40, coded_every=5, val_every=4)
-    coarse = TexelCodeOptions(step=30.0)
-    still = tune_atlas(rounded, views, BACKGROUND, replace(options, coded_steps=0), coding=coarse)
-    tuned = tune_atlas(rounded, views, BACKGROUND, options, coding=coarse)
+    coarse = replace(rounded, coding=TexelCodeOptions(step=30.0))
+    still = tune_atlas(coarse, views, BACKGROUND, replace(options, coded_steps=0))
+    tuned = tune_atlas(coarse, views, BACKGROUND, options)
 
-    def against_photographs(baked: BakeState) -> float:
-        return sum(float((render(baked, v.camera).clamp(0, 1) - v.image).square().mean()) for v in views)
+    def against_photographs(baked: Coded) -> float:
+        drawn = [(baked.scene.render(v.camera, BACKGROUND).rgb, v.image) for v in views]
+        return sum(float((rgb.clamp(0, 1) - image).square().mean()) for rgb, image in drawn)
 
     assert against_photographs(tuned) <= against_photographs(still)
-    torch.testing.assert_close(tuned.mean_residual, tuned.codes.texels.constants)
+    torch.testing.assert_close(tuned.scene.mean_residual, tuned.codes.texels.constants)
     export(tuned, tmp_path / "b")
     bundle, checks = check_files(tmp_path / "b")
     wrong = [check for check in checks if not check.ok and check.name != "statistics"]  # a tile was taken out above
     assert bundle is not None and not wrong
     for view in views[:2]:
-        want = tuned.stored().render(view.camera, BACKGROUND).rgb
+        want = tuned.scene.render(view.camera, BACKGROUND).rgb
         torch.testing.assert_close(bundle.scene.render(view.camera, BACKGROUND).rgb, want, rtol=1e-4, atol=1e-4)

@@ -5,9 +5,20 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, bake_field, export, rich_progress
+from bitymi_ns.bake import (
+    BakeOptions,
+    RefineOptions,
+    TuneOptions,
+    bake,
+    bake_field,
+    export,
+    rich_progress,
+)
+from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import read_bundle
+from bitymi_ns.scene import Camera
 from bitymi_ns.train.init import tangents
+from bitymi_ns.train.views import View
 
 
 def bilinear(bundle, surfel, u, v, extent=3.0):
@@ -108,11 +119,9 @@ def test_a_scene_without_texture_has_no_atlas(scene, tmp_path):
     export(baked, tmp_path / "b")
     loaded = read_bundle(tmp_path / "b")
     assert loaded.scene.atlas is None and not loaded.scene.tiles.any() and loaded.info.atlas is None
-    with pytest.raises(ValueError):
-        baked.with_texels(torch.zeros(20, 3))
 
 
-def test_fine_tuned_texels_are_encoded_anew(scene, capsys):
+def test_a_bake_tells_its_steps_and_is_the_same_again(scene, capsys):
     with rich_progress() as progress:
         baked = bake_field(scene(30), progress=progress)
     out = capsys.readouterr().out
@@ -120,14 +129,32 @@ def test_fine_tuned_texels_are_encoded_anew(scene, capsys):
     again = bake_field(scene(30))  # the layout does not depend on the run
     np.testing.assert_array_equal(again.packing.tiles, baked.packing.tiles)
     assert again.atlas.payload == baked.atlas.payload and again.atlas.range == baked.atlas.range
-    tuned = baked.with_texels(baked.texels + 1.0).encoded()
-    tiled = torch.from_numpy(baked.packing.tiles[:, 3:4] > 0)
-    assert tiled.any() and not tiled.all()
-    torch.testing.assert_close(tuned.mean_residual, baked.mean_residual + 1.0)
-    assert baked.statistics.certificate is not None and tuned.statistics.certificate is None
-    assert tuned.atlas.range.offset == pytest.approx(baked.atlas.range.offset + 1.0, abs=1e-4)
-    with pytest.raises(ValueError, match="do not fit"):
-        baked.with_texels(baked.texels[:4])
+
+
+class Elsewhere(Camera):
+    """A camera on another device: its matrices have no values before it is moved."""
+
+    def to(self, device):
+        assert device == torch.device("cpu") or device == "cpu"
+        return self.__dict__["there"]
+
+    @classmethod
+    def of(cls, camera):
+        made = cls(camera.viewmat.to("meta"), camera.K.to("meta"), camera.width, camera.height)
+        made.__dict__["there"] = camera
+        return made
+
+
+@pytest.mark.parametrize("compact", [None, Compact(share=0.5, views=1)], ids=["pages", "compact"])
+def test_the_scenes_device_does_the_work_and_not_that_of_the_cameras(scene, camera, compact):
+    made, background, found = scene(60), torch.zeros(3), []
+    refine = RefineOptions(tune=TuneOptions(steps=2, coded_steps=2), compact=compact)
+    for cameras in ([camera(4.0 + i) for i in range(4)], [Elsewhere.of(camera(4.0 + i)) for i in range(4)]):
+        photographs = [View(each, torch.full((48, 64, 3), 0.5)) for each in cameras]
+        found.append(bake(made, cameras, photographs, background, BakeOptions(format="uint8"), refine))
+    here, there = found
+    assert torch.equal(here.shown, there.shown) and torch.equal(here.rows, there.rows)
+    assert here.statistics.certificate == there.statistics.certificate
 
 
 def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, BakeState, bake_field
+from bitymi_ns.bake import BakeOptions, Coded, bake_field
 from bitymi_ns.bake.field.tiles import grids
 from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.tiles import fit, interpolation
@@ -48,7 +48,7 @@ def discs(scene):
     return make
 
 
-def error_of_the_first(baked: BakeState, made: SimpleNamespace, axes: torch.Tensor, uv: torch.Tensor) -> float:
+def error_of_the_first(baked: Coded, made: SimpleNamespace, axes: torch.Tensor, uv: torch.Tensor) -> float:
     """Compute the weighted root mean square error of the first disc at points [M, 2], 8-bit steps."""
     r_u, r_v = baked.sizes[0].clamp(min=1).tolist()
     tile, extent = baked.texels[: r_u * r_v].view(r_v, r_u, 3), float(baked.extent[0])
@@ -60,7 +60,7 @@ def error_of_the_first(baked: BakeState, made: SimpleNamespace, axes: torch.Tens
     return float(error.square().mean().sqrt())
 
 
-def centers(baked: BakeState) -> torch.Tensor:
+def centers(baked: Coded) -> torch.Tensor:
     """List the texel centres [M, 2] of the first tile before it was reduced."""
     side = round((baked.statistics.texels.within_visible_part / 8) ** 0.5)
     at = texel_centers(side).float() * float(baked.extent[0]) / 3
@@ -91,7 +91,7 @@ def test_a_constant_residual_needs_no_tile(discs):
     made.field = flat(torch.zeros(3), 0.0)
     baked = bake_field(made, options=OPTIONS)
     assert baked.atlas is None and not baked.packing.tiles.any()
-    torch.testing.assert_close(baked.mean_residual, torch.full((8, 3), 0.25))
+    torch.testing.assert_close(baked.scene.mean_residual, torch.full((8, 3), 0.25))
     assert baked.statistics.surfels.without_tile == 8
 
 

@@ -3,20 +3,33 @@
 from dataclasses import replace
 from functools import partial
 from statistics import fmean
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import BakeOptions, BakeState, TuneOptions, bake_field, tune_atlas
+from bitymi_ns.bake import (
+    BakeOptions,
+    Coded,
+    Reduced,
+    Stage,
+    Trained,
+    TuneOptions,
+    prune_and_resample,
+    tune_atlas,
+)
+from bitymi_ns.bake.field.tiles import field_tiles
+from bitymi_ns.bake.pipeline import trained_texels
+from bitymi_ns.bake.stages import with_means
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tuning_views import TexelList, TuningView, TuningViews
-from bitymi_ns.codec.pages import listed_texels
+from bitymi_ns.codec.pages import tile_means
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import MemoryBudget, View
 
+S = TypeVar("S", bound=Stage)
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 OPTIONS = TuneOptions(steps=60, rate=0.3, val_every=4, coded_steps=0)
 
@@ -34,60 +47,73 @@ def cameras() -> list[Camera]:
     return views
 
 
-def render(baked: BakeState, camera: Camera) -> Tensor:
+def render(baked: Stage, camera: Camera) -> Tensor:
     return baked.unquantised().render(camera, BACKGROUND).rgb
 
 
-def waving(made: Any, **options: Any) -> BakeState:
-    """Bake large surfels with a waving residual; the first one's is constant, the last is unseen."""
+def waving(made: Any, pixels_per_texel: float | None = None) -> Trained:
+    """Make large surfels with a waving residual; the first one's is constant, the last is unseen."""
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0
     made.surfels["means"][59] = torch.tensor([0.0, 100.0, 0.0])
-    baked = bake_field(made, options=BakeOptions(format="fp16", r_max=8), **options)
-    baked.scene.weight_bound = 0.02
+    baked = trained_texels(made, BakeOptions(format="fp16", r_max=8))
+    baked = field_tiles(baked, made.field, (), pixels_per_texel)
     area, sizes = int(baked.sizes[0].prod()), baked.sizes.clone()
     sizes[0] = 0
     texels = torch.cat([torch.full((1, 3), 0.3), baked.texels[area:]])
     return baked.with_tiles(Tiles(sizes, baked.extent, texels))
 
 
-def tuning_views(baked: BakeState, views: list[View], budget: int = 1 << 30) -> TuningViews:
+def bounded(baked: S) -> S:
+    """Show no residual of faint fragments."""
+    baked.scene.weight_bound = 0.02
+    return baked
+
+
+def waving_reduced(made: Any) -> Reduced:
+    return bounded(prune_and_resample(waving(made), ()))
+
+
+def with_texels(baked: Reduced, texels: Tensor) -> Reduced:
+    return replace(baked, texels=texels, scene=with_means(baked.scene, tile_means(texels, baked.sizes)))
+
+
+def tuning_views(baked: Stage, views: list[View], budget: int = 1 << 30) -> TuningViews:
     return TuningViews(TexelList(baked), views, BACKGROUND, MemoryBudget(budget))
 
 
-def texels_of(baked: BakeState) -> Tensor:
+def texels_of(baked: Stage) -> Tensor:
     return TexelList(baked).values
 
 
-def photographs(truth: BakeState) -> list[View]:
+def photographs(truth: Stage) -> list[View]:
     return [View(camera, render(truth, camera).clamp(0.0, 1.0)) for camera in cameras()]
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> BakeState:
+def truth(scene) -> Reduced:
     """The scene in the photographs."""
-    return waving(scene(60))
+    return waving_reduced(scene(60))
 
 
 @pytest.fixture(scope="module")
-def views(truth: BakeState) -> list[View]:
+def views(truth: Reduced) -> list[View]:
     return photographs(truth)
 
 
 @pytest.fixture(scope="module")
-def wrong(truth: BakeState) -> BakeState:
+def wrong(truth: Reduced) -> Reduced:
     """`truth` with a constant residual."""
-    grey = truth.with_constants(torch.full_like(truth.mean_residual, 0.1))
-    return grey.with_texels(torch.full_like(truth.texels, 0.1))
+    return with_texels(truth, torch.full_like(truth.texels, 0.1))
 
 
-def test_tuning_finds_what_the_photographs_show(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
+def test_tuning_finds_what_the_photographs_show(truth: Reduced, wrong: Reduced, views: list[View]) -> None:
     tuned = tune_atlas(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
     statistics = tuned.statistics.finetune
     assert statistics.views == 7 and statistics.held_in_views == 3
     for gain in (statistics.psnr_held_in, statistics.psnr_held_out):
         assert gain.after > gain.before + 3
-    error = (tuned.mean_residual - truth.mean_residual)[0].abs()
+    error = (tuned.scene.mean_residual - truth.scene.mean_residual)[0].abs()
     assert (error < 0.05).all()  # a surfel without a tile gets its constant
     assert tuned.atlas.psnr is not None and tuned.atlas.payload != wrong.encoded().atlas.payload
     assert (wrong.texels == 0.1).all() and wrong.statistics.finetune is None  # the bake itself is as it was
@@ -96,7 +122,7 @@ def test_tuning_finds_what_the_photographs_show(truth: BakeState, wrong: BakeSta
     assert float(sum(seen) / 2) == pytest.approx(stated, abs=0.01)
 
 
-def test_its_pictures_are_the_renderers(truth: BakeState) -> None:
+def test_its_pictures_are_the_renderers(truth: Reduced) -> None:
     for camera in cameras()[:2]:
         want = render(truth, camera)
         drawn = tuning_views(truth, [View(camera, want)])
@@ -104,7 +130,7 @@ def test_its_pictures_are_the_renderers(truth: BakeState) -> None:
         torch.testing.assert_close(got, want, rtol=1e-5, atol=1e-5)
 
 
-def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: BakeState, views: list[View]) -> None:
+def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Reduced, views: list[View]) -> None:
     scene = TexelList(wrong)
     seen = scene.coverage([v for i, v in enumerate(views) if i % 4])[:, 0]
     tuned = texels_of(tune_atlas(wrong, views, BACKGROUND, OPTIONS))
@@ -116,7 +142,7 @@ def test_texels_that_no_view_sees_stay_and_the_hardly_seen_hardly_move(wrong: Ba
     assert moved[few].mean() < 0.2 * moved[many].mean()
 
 
-def test_coverage_of_several_views_is_their_sum(wrong: BakeState, views: list[View]) -> None:
+def test_coverage_of_several_views_is_their_sum(wrong: Reduced, views: list[View]) -> None:
     texels = TexelList(wrong)
     both = texels.coverage(views[:5])
     torch.testing.assert_close(both, sum(texels.coverage([view]) for view in views[:5]))
@@ -129,7 +155,7 @@ def test_coverage_of_several_views_is_their_sum(wrong: BakeState, views: list[Vi
 
 @pytest.mark.parametrize("patience", [2, 99])
 def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
-    wrong: BakeState, views: list[View], patience: int
+    wrong: Reduced, views: list[View], patience: int
 ) -> None:
     told: list[tuple[int, int]] = []
 
@@ -157,7 +183,7 @@ def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
 
 @pytest.mark.parametrize("coded", [False, True])
 def test_the_texels_kept_are_those_of_the_best_evaluation(
-    wrong: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch, coded: bool
+    wrong: Reduced, views: list[View], monkeypatch: pytest.MonkeyPatch, coded: bool
 ) -> None:
     """A run that gains, then loses, as its rate rises instead of falling."""
     seen: list[tuple[float, Tensor]] = []
@@ -179,21 +205,21 @@ def test_the_texels_kept_are_those_of_the_best_evaluation(
     best = max(range(len(seen)), key=lambda i: seen[i][0])
     assert 0 < best < len(seen) - 1 and seen[-1][0] < seen[best][0] - 0.5
     if coded:
-        kept = listed_texels(torch.from_numpy(tuned.atlas.decoded()), tuned.packing, tuned.mean_residual)
+        kept = tuned.shown
     else:
         kept = texels_of(tuned)
         assert tuned.statistics.finetune.psnr_held_in.after == pytest.approx(seen[best][0], abs=1e-4)
     torch.testing.assert_close(kept, seen[best][1], rtol=0, atol=0)
 
 
-def test_memory_for_the_views_does_not_change_the_result(wrong: BakeState, views: list[View]) -> None:
+def test_memory_for_the_views_does_not_change_the_result(wrong: Reduced, views: list[View]) -> None:
     few = replace(OPTIONS, steps=8)
     results = [tune_atlas(wrong, views, BACKGROUND, replace(few, cache_bytes=b)) for b in (0, 200_000, 1 << 30)]
     assert all(torch.equal(r.texels, results[0].texels) for r in results)
 
 
 def test_a_view_with_many_fragments_is_traced_in_bands(
-    wrong: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch
+    wrong: Reduced, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def learned() -> tuple[TuningView, Tensor]:
         drawn, texels = tuning_views(wrong, views[:1]), texels_of(wrong)
@@ -209,7 +235,7 @@ def test_a_view_with_many_fragments_is_traced_in_bands(
     assert not torch.equal(texels, texels_of(wrong))
 
 
-def test_masked_pixels_and_alpha(wrong: BakeState, views: list[View]) -> None:
+def test_masked_pixels_and_alpha(wrong: Reduced, views: list[View]) -> None:
     few = replace(OPTIONS, steps=12)
     mask = torch.ones(40, 48, 1, dtype=torch.bool)
     mask[:, :24] = False
@@ -224,7 +250,7 @@ def test_masked_pixels_and_alpha(wrong: BakeState, views: list[View]) -> None:
     assert torch.equal(*same)
 
 
-def with_exposures(truth: BakeState, views: list[View]) -> list[View]:
+def with_exposures(truth: Reduced, views: list[View]) -> list[View]:
     exposed = []
     for view, log in zip(views, torch.linspace(-0.4, 0.4, len(views)), strict=True):
         alpha = truth.unquantised().render(view.camera, BACKGROUND).alpha
@@ -233,7 +259,7 @@ def with_exposures(truth: BakeState, views: list[View]) -> list[View]:
     return exposed
 
 
-def test_exposures_are_not_tuned_into_the_texels(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
+def test_exposures_are_not_tuned_into_the_texels(truth: Reduced, wrong: Reduced, views: list[View]) -> None:
     exposed = with_exposures(truth, views)
     assert tuning_views(truth, exposed).psnr(texels_of(truth)) > 55  # background and all
     blind = [view._replace(correction=None) for view in exposed]
@@ -244,47 +270,45 @@ def test_exposures_are_not_tuned_into_the_texels(truth: BakeState, wrong: BakeSt
     assert after["known"] > after["unknown"] + 1.0
 
 
-def test_too_few_views_leave_the_atlas_alone(scene, wrong: BakeState, views: list[View]) -> None:
+def test_too_few_views_leave_the_atlas_alone(scene, wrong: Reduced, views: list[View]) -> None:
     same = tune_atlas(wrong, views[:3], BACKGROUND)
     assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}
     with pytest.raises(ValueError, match="without texture"):
-        tune_atlas(bake_field(scene(20, field=None)), views, BACKGROUND)
+        tune_atlas(prune_and_resample(trained_texels(scene(20, field=None), BakeOptions()), ()), views, BACKGROUND)
 
 
 @pytest.mark.parametrize("bad", [{"steps": -1}, {"val_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}])
-def test_options_out_of_range_are_refused(wrong: BakeState, views: list[View], bad: dict[str, float]) -> None:
+def test_options_out_of_range_are_refused(wrong: Reduced, views: list[View], bad: dict[str, float]) -> None:
     tune = partial(tune_atlas, wrong, views, BACKGROUND)
     with pytest.raises(ValueError, match=next(iter(bad))):
         tune(replace(TuneOptions(), **bad))
 
 
-def error(baked: BakeState, views: list[View]) -> float:
+def error(baked: Coded, views: list[View]) -> float:
     """Compute the mean squared error of the stored scene."""
-    scene = baked.stored()
-    return fmean(float((scene.render(v.camera, BACKGROUND).rgb - v.image).square().mean()) for v in views)
+    return fmean(float((baked.scene.render(v.camera, BACKGROUND).rgb - v.image).square().mean()) for v in views)
 
 
 @pytest.mark.parametrize("format", ["bc7", "uint8"])
-def test_the_last_steps_see_what_is_stored(truth: BakeState, views: list[View], format: str) -> None:
+def test_the_last_steps_see_what_is_stored(truth: Reduced, views: list[View], format: str) -> None:
     """With texels that BC7 blocks cannot hold, the render of the stored ones improves, with or without validation
     views."""
     options = replace(truth.options, format=format)
     generator = torch.Generator().manual_seed(3)
     noise = 0.2 * torch.randn(truth.texels.shape, generator=generator)
-    noisy = replace(truth, options=options).with_texels(truth.texels + noise)
+    noisy = with_texels(replace(truth, options=options), truth.texels + noise)
     plain = noisy.encoded()
     for val_every in (0, 4):
         steps = TuneOptions(steps=0, coded_steps=40, coded_rate=0.3, val_every=val_every)
         tuned = tune_atlas(noisy, views, BACKGROUND, steps)
         assert error(tuned, views) < 0.8 * error(plain, views)
         assert tuned.statistics.finetune.steps == 40
-        decoded = listed_texels(torch.from_numpy(tuned.atlas.decoded()), tuned.packing, tuned.mean_residual)
-        assert float((decoded - tuned.texels).abs().max()) < 0.75  # stored texels are those
+        assert float((tuned.shown - tuned.texels).abs().max()) < 0.75  # stored texels are those
     few = tune_atlas(noisy, views[:1], BACKGROUND, TuneOptions.of_learned(5))
     assert few.atlas is not None and few.statistics.finetune.psnr_held_in is None
 
 
-def test_texels_that_have_learned_stay_when_nothing_is_left_to_learn(truth: BakeState) -> None:
+def test_texels_that_have_learned_stay_when_nothing_is_left_to_learn(truth: Reduced) -> None:
     """Fine-tuning towards photographs of the scene itself does not drift."""
     scene = replace(truth, options=replace(truth.options, format="fp16"))
     views = photographs(scene)

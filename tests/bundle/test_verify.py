@@ -89,10 +89,3 @@ def test_contents_that_are_wrong_are_found_behind_a_good_hash(made):
     assert "tiles" in failures(folder)
     change_columns(folder, lambda columns: columns["opacity"].__setitem__(3, np.nan))
     assert failures(folder) == ["contents"]
-
-
-def test_changed_texels_lose_their_certificate(scene, tmp_path):
-    baked = bake_field(scene(30))
-    export(baked.with_texels(baked.texels + 0.1), tmp_path / "b")
-    _, checks = check_files(tmp_path / "b")
-    assert all(check.ok for check in checks) and "certificate" not in {check.name for check in checks}

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 import pytest
 import torch
 
-from bitymi_ns.bake import BakeOptions, BakeState, PolishOptions, RefineOptions, TuneOptions, bake
+from bitymi_ns.bake import BakeOptions, Coded, PolishOptions, RefineOptions, TuneOptions, bake
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import cuda_backend
@@ -47,15 +47,15 @@ def trained() -> tuple[Scene, list[View]]:
     return trainer.scene, [*views, *views]
 
 
-def exported(scene: Scene, views: list[View], device: torch.device, refine: RefineOptions) -> BakeState:
-    cameras = [view.camera.to(device) for view in views]
+def exported(scene: Scene, views: list[View], device: torch.device, refine: RefineOptions) -> Coded:
+    cameras = [view.camera for view in views]  # the scene's device does the work
     options = BakeOptions(tolerance=0.75, format="uint8")
     return bake(scene.to(device), cameras, views, BACKGROUND, options, refine)
 
 
-def db(baked: BakeState, views: list[View]) -> float:
+def db(baked: Coded, views: list[View]) -> float:
     """Compute the PSNR against the photographs, masked."""
-    errors = [(baked.stored().render(v.camera, BACKGROUND).rgb - v.image).square() for v in views]
+    errors = [(baked.scene.render(v.camera, BACKGROUND).rgb - v.image).square() for v in views]
     return -10 * float(torch.stack([e.mean() for e in errors]).mean().log10())
 
 

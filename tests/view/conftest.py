@@ -11,11 +11,13 @@ import pytest
 import torch
 from PIL import Image
 
-from bitymi_ns.bake import BakeState, bake_field, export
-from bitymi_ns.bake.compact import compacted, with_coded_texels
-from bitymi_ns.bake.state import joined
+from bitymi_ns.bake import Coded, Reduced, export, prune_and_resample
+from bitymi_ns.bake.compact import compacted
+from bitymi_ns.bake.field.tiles import field_tiles
+from bitymi_ns.bake.pipeline import trained_texels
+from bitymi_ns.bake.stages import with_means
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.codec.pages import tile_means
+from bitymi_ns.codec.pages import joined, tile_means
 from bitymi_ns.scene import Camera
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
@@ -29,11 +31,11 @@ def view() -> Camera:
     return front(WIDTH, HEIGHT, 3.0)
 
 
-def with_alpha(baked: BakeState) -> BakeState:
+def with_alpha(baked: Reduced) -> Reduced:
     """Add random alphas from 0 to 2 to a bake."""
     random = torch.Generator().manual_seed(0)
     texels = joined(baked.texels, 2 * torch.rand(len(baked.texels), generator=random))
-    return replace(baked, texels=texels, atlas=None).with_constants(tile_means(texels, baked.sizes))
+    return replace(baked, texels=texels, scene=with_means(baked.scene, tile_means(texels, baked.sizes)))
 
 
 @lru_cache
@@ -47,14 +49,16 @@ def baked_scene(
     larger: float,
     alpha: bool,
     options: tuple[tuple[str, object], ...],
-) -> BakeState:
+) -> Coded:
     """Bake the test scene; `compact`: version 3; `seen`: photographed by the camera, so that views adapt to their size;
     `larger`: added to the log scales; `alpha`: with alpha texels."""
     made = real_scene(make_surfels, count=count, kind=kind)
     made.surfels["log_scales"] += larger
-    baked = bake_field(made, [view()] if seen else [], options=BakeOptions(format=format, **dict(options)))
+    cameras = [view()] if seen else []
+    trained = field_tiles(trained_texels(made, BakeOptions(format=format, **dict(options))), made.field, cameras)
+    baked = prune_and_resample(trained, cameras)
     baked = with_alpha(baked) if alpha else baked
-    return with_coded_texels(*compacted(baked, [], torch.zeros(3))) if compact else baked
+    return (compacted(baked, [], torch.zeros(3)) if compact else baked).encoded()
 
 
 def write(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, evaluate, gain, validation_split
-from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.stages import Trained
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import FineTuning
@@ -40,16 +40,15 @@ class PolishOptions(TuneOptions):
 
 
 def _polish_run(
-    baked: BakeState,
+    baked: Trained,
     views: Sequence[View],
     background: Tensor,
     options: PolishOptions,
     train: TrainConfig,
-    device: torch.device | str,
     progress: Progress,
 ) -> Trainer:
     """Set up a training run that consists of the texel stage alone and keeps the number of surfels."""
-    texels = TexelList(baked, device)
+    texels = TexelList(baked)
     drawn, tiles = texels.scene, texels.tiles
     share = 1.0 / (texels.coverage(views, progress)[:, 0] + options.prior)
     config = SceneConfig(
@@ -71,15 +70,13 @@ def _polish_run(
         seed=options.seed,
     )
     run = Trainer(scene, views, train, options.steps)
-    run.training.background = background.to(device)
+    run.training.background = background
     return run
 
 
 @torch.no_grad()
-def _psnr(run: Trainer, views: Sequence[View], progress: Progress = no_progress) -> float:
+def _psnr(run: Trainer, background: Tensor, views: Sequence[View], progress: Progress = no_progress) -> float:
     """Average the PSNR, dB, over views with an unmasked pixel."""
-    background = run.training.background
-    assert background is not None
     moved = (view.to(background.device) for view in views)
     drawn = ((view, run.scene.render(view.camera, background)) for view in moved)
     pictures = (
@@ -90,15 +87,14 @@ def _psnr(run: Trainer, views: Sequence[View], progress: Progress = no_progress)
 
 
 def polish_scene(
-    baked: BakeState,
+    baked: Trained,
     views: Sequence[View],
     background: Tensor,
     options: PolishOptions | None = None,
     train: TrainConfig | None = None,
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
-    device: torch.device | str = "cpu",
-) -> BakeState:
+) -> Trained:
     """Optimise texels and surfels of a bake together against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
 
     Surfels move by Adam, texels as in `tune_atlas`, with the coverage of the bake. Surfels keep their tiles with their
@@ -122,34 +118,37 @@ def polish_scene(
     """
     options = options or PolishOptions()
     options.check()
-    if "view_terms" in baked.scene.surfels:
-        raise ValueError("the view colours are reduced already: polish a bake that was made with pixels_per_texel")
     if len(views) < FEWEST_VIEWS:
-        return replace(baked, statistics=baked.statistics.replace(polish=FineTuning(steps=0, views=len(views))))
+        return baked.stating(polish=FineTuning(steps=0, views=len(views)))
     started, cpu_started = time.perf_counter(), time.process_time()
     validation, trained = validation_split(views, options.val_every)
-    train = train or TrainConfig()
-    run = _polish_run(baked, trained, background, options, train, device, progress)
-    before = _psnr(run, eval_views) if eval_views else math.nan
-    stopping = _optimise(run, validation, options, train.guard, progress)
+    train, background = train or TrainConfig(), background.to(baked.device)
+    run = _polish_run(baked, trained, background, options, train, progress)
+    before = _psnr(run, background, eval_views) if eval_views else math.nan
+    stopping = _optimise(run, background, validation, options, train.guard, progress)
     run.scene.load_state_dict(stopping.best)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = stopping.statistics(len(trained), len(validation), *spent).replace(
-        psnr_held_out=gain(before, _psnr(run, eval_views)) if eval_views else None
+        psnr_held_out=gain(before, _psnr(run, background, eval_views)) if eval_views else None
     )
-    result = baked.with_texels(run.scene.field.texels.detach()).with_surfels(dict(run.scene.surfels))
-    return replace(result, statistics=result.statistics.replace(polish=statistics))
+    result = baked.with_colors(run.scene.field.texels).with_surfels(dict(run.scene.surfels))
+    return result.stating(polish=statistics)
 
 
 def _optimise(
-    run: Trainer, validation: Sequence[View], options: PolishOptions, guard: GuardConfig, progress: Progress
+    run: Trainer,
+    background: Tensor,
+    validation: Sequence[View],
+    options: PolishOptions,
+    guard: GuardConfig,
+    progress: Progress,
 ) -> EarlyStopping[dict[str, Tensor]]:
     """Train; return the state that shows the validation views best, and the evaluations."""
 
     def state() -> dict[str, Tensor]:
         return {name: value.detach().clone() for name, value in run.scene.state_dict().items()}
 
-    before, failures = _psnr(run, validation, progress), 0
+    before, failures = _psnr(run, background, validation, progress), 0
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, state())
     for number in range(options.steps):
         run.step, due = number, stopping.due(number + 1)
@@ -165,7 +164,7 @@ def _optimise(
             failures += 1
         more = failures < guard.rollbacks
         if not more or due:
-            more = stopping.update(number + 1, _psnr(run, validation), state) and more
+            more = stopping.update(number + 1, _psnr(run, background, validation), state) and more
         progress("polishing", number + 1, options.steps if more else number + 1)
         if not more:
             break

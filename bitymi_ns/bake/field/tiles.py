@@ -1,15 +1,14 @@
 """Tiles of a residual field (paper, section Texture Baking): a grid for every surfel, with the field at its texels."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.inputs import BakeInput, device_of
+from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bake.prune import drop_unseen
-from bitymi_ns.bake.state import BakeState
+from bitymi_ns.bake.stages import Trained
 from bitymi_ns.bake.tile_errors import closest_pixels
 from bitymi_ns.bake.tiles import Tiles, grid
 from bitymi_ns.bundle.bake_options import BakeOptions
@@ -45,12 +44,12 @@ class Field(Protocol):
 
 @torch.no_grad()
 def field_tiles(
-    baked: BakeState,
+    baked: Trained,
     field: Field,
     cameras: Sequence[Camera],
     pixels_per_texel: float | None = None,
     progress: Progress = no_progress,
-) -> BakeState:
+) -> Trained:
     """Give the surfels of a bake tiles with the values of a field at the texel centres; leave out surfels as
     `prune.drop_unseen` does. The tiles are not reduced yet (`prune.prune_and_resample`).
 
@@ -59,7 +58,7 @@ def field_tiles(
 
     Args:
         baked: without tiles.
-        field: on the device of the cameras.
+        field: on the device of the scene.
         cameras: training views, for the cap on tile sizes and for what they see.
         pixels_per_texel: a tile gets at most one texel per this number of pixels that its surfel fills in the view that
             shows most of it; None = as many as field and views resolve.
@@ -67,7 +66,7 @@ def field_tiles(
     Raises:
         ValueError: no surfel is left, or the atlas would be too large.
     """
-    options, paper = baked.options, _paper_texels(baked, field, device_of(cameras))
+    options, paper = baked.options, _paper_texels(baked, field)
     baked, inputs = drop_unseen(baked, cameras, progress)
     sizes, extent, counts = grids(inputs, field, options, pixels_per_texel)
     edges = tangents(inputs.surfels["quats"]) * inputs.surfels["log_scales"].exp()[:, None, :]
@@ -89,7 +88,7 @@ def field_tiles(
     baked = baked.with_tiles(Tiles(sizes.cpu(), extent.cpu(), texels))
     polished = None if pixels_per_texel is None else baked.packing.texels
     counts = counts.replace(paper=paper, polished=polished, kept=baked.packing.texels, not_finite=int(bad.sum()))
-    return replace(baked, statistics=baked.statistics.replace(texels=counts))
+    return baked.stating(texels=counts)
 
 
 def grids(
@@ -127,10 +126,10 @@ def grids(
     return torch.where(extent[:, None] > 0, sizes, 0), extent, counts
 
 
-def _paper_texels(baked: BakeState, field: Field, device: torch.device) -> int:
+def _paper_texels(baked: Trained, field: Field) -> int:
     """Count the texels by the paper's rule: the smallest voxel size everywhere, and tiles of extent 4."""
     options = baked.options
-    means, scales = (baked.scene.surfels[name].to(device) for name in ("means", "log_scales"))
+    means, scales = (baked.scene.surfels[name].to(baked.device) for name in ("means", "log_scales"))
     finest = torch.stack([field.voxel_size(part).amin() for part in means.split(options.chunk)]).amin()
     rates = (scales.exp(), finest.expand(scales.shape), PAPER_EXTENT)
     return _texels(nyquist_resolution(*rates, options.r_min, options.r_max))

@@ -11,53 +11,62 @@ from torch import Tensor
 
 from bitymi_ns.bake import (
     BakeOptions,
-    BakeState,
     PolishOptions,
+    Reduced,
+    Stage,
+    Trained,
     TuneOptions,
     bake_field,
     polish_scene,
     prune_and_resample,
     tune_atlas,
 )
+from bitymi_ns.bake.field.tiles import field_tiles
+from bitymi_ns.bake.pipeline import trained_texels
+from bitymi_ns.scene import Camera
 from bitymi_ns.train import losses
 from bitymi_ns.train.config import GuardConfig
 from bitymi_ns.train.views import View
-from tests.bake.test_tune import BACKGROUND, cameras, photographs, render, waving, with_exposures
+from tests.bake.test_tune import BACKGROUND, bounded, cameras, photographs, render, waving, with_exposures
 
 OPTIONS = PolishOptions(steps=40, rate=0.3, share=1.0, val_every=4)
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> BakeState:
+def truth(scene) -> Trained:
     """The scene in the photographs, with full view colours."""
-    return waving(scene(60), pixels_per_texel=0.5)
+    return bounded(waving(scene(60), pixels_per_texel=0.5))
 
 
 @pytest.fixture(scope="module")
-def views(truth: BakeState) -> list[View]:
+def views(truth: Trained) -> list[View]:
     return photographs(truth)
 
 
 @pytest.fixture(scope="module")
-def wrong(truth: BakeState) -> BakeState:
+def wrong(truth: Trained) -> Trained:
     """`truth` with a constant residual, surfels shifted and fainter."""
     g = torch.Generator().manual_seed(0)
     surfels = {name: value.clone() for name, value in truth.scene.surfels.items()}
     surfels["means"] += 0.03 * torch.randn(surfels["means"].shape, generator=g)
     surfels["opacity_logits"] -= 0.4
-    grey = truth.with_constants(torch.full_like(truth.mean_residual, 0.1))
-    return grey.with_texels(torch.full_like(truth.texels, 0.1)).with_surfels(surfels)
+    return truth.with_colors(torch.full_like(truth.texels, 0.1)).with_surfels(surfels)
 
 
-def db(baked: BakeState, views: list[View]) -> float:
+def db(baked: Stage, views: list[View]) -> float:
     """Compute the mean PSNR before quantisation."""
     errors = [(render(baked, v.camera).clamp(0, 1) - v.image).square().mean() for v in views]
     return float(torch.stack(errors).log10().mean() * -10)
 
 
-def test_everything_learns_and_the_gain_is_what_is_stated(wrong: BakeState, views: list[View]) -> None:
+def tiles_of(made: Any, seen: list[Camera], pixels_per_texel: float, options: BakeOptions | None = None) -> Trained:
+    return field_tiles(trained_texels(made, options or BakeOptions()), made.field, seen, pixels_per_texel)
+
+
+def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Trained, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS, eval_views=views[10:])
-    tuned = tune_atlas(wrong, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, val_every=4, coded_steps=0))
+    same = wrong.become(Reduced, in_front=torch.ones(60), colors=None)
+    tuned = tune_atlas(same, views[:10], BACKGROUND, TuneOptions(steps=40, rate=0.3, val_every=4, coded_steps=0))
     told = polished.statistics.polish
     assert (told.views, told.held_in_views, told.steps) == (7, 3, 40)
     assert told.psnr_held_in.after > told.psnr_held_in.before + 3
@@ -67,30 +76,26 @@ def test_everything_learns_and_the_gain_is_what_is_stated(wrong: BakeState, view
     for name, before in wrong.scene.surfels.items():
         after = polished.scene.surfels[name]
         assert not torch.equal(after, before) and torch.equal(after[59], before[59]), name  # no view sees the last one
-    assert polished.atlas is None
     assert torch.equal(polished.extent, wrong.extent) and (polished.packing.tiles == wrong.packing.tiles).all()
     assert (wrong.texels == 0.1).all() and wrong.statistics.polish is None  # the bake itself is as it was
 
 
-def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: BakeState, views: list[View]) -> None:
+def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Trained, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS)
     polished.scene.surfels["opacity_logits"][5] = -9.0  # no longer drawn
     lean = prune_and_resample(polished, [v.camera for v in views[:10]])
     assert "view_terms" in lean.scene.surfels and lean.statistics.view_color.error.p100 <= 0.76
     left = lean.statistics.surfels
     assert (left.kept, left.left_out.transparent, left.left_out.unseen) == (58, 1, 1)
-    assert lean.rows.tolist() == [i for i in range(60) if i not in (5, 59)] and lean.atlas is None
+    assert lean.rows.tolist() == [i for i in range(60) if i not in (5, 59)]
     assert db(lean, views[10:]) == pytest.approx(db(polished, views[10:]), abs=0.1)
     again = tune_atlas(lean, views[:10], BACKGROUND, TuneOptions(steps=8, coded_steps=0, patience=8))
     assert again.statistics.polish == polished.statistics.polish and again.statistics.finetune.steps == 8
-    with pytest.raises(ValueError, match="reduced already"):
-        polish_scene(lean, views, BACKGROUND, OPTIONS)
 
 
 def test_a_bake_whose_surfels_did_not_change_is_nearly_that_of_one_go(scene, views: list[View]) -> None:
     made, seen, options = scene(60), [v.camera for v in views], BakeOptions(format="fp16")
-    once, later = (bake_field(made, seen, options, pixels_per_texel=each) for each in (None, 1e-3))
-    assert later.atlas is None and once.atlas is not None
+    once, later = bake_field(made, seen, options), tiles_of(made, seen, 1e-3, options)
     assert (later.packing.tiles[:, 3:] >= once.packing.tiles[:, 3:]).all()
     later = prune_and_resample(later, seen)
     assert all(torch.equal(later.scene.surfels[name], value) for name, value in once.scene.surfels.items())
@@ -103,11 +108,11 @@ def test_a_bake_whose_surfels_did_not_change_is_nearly_that_of_one_go(scene, vie
 
 def test_tiles_are_as_fine_as_the_views_see(scene, views: list[View]) -> None:
     made, seen = scene(60), [v.camera for v in views]
-    sizes = [bake_field(made, seen, pixels_per_texel=each).packing.tiles[:, 3:].prod(1) for each in (0.05, 2.0, 1e6)]
+    sizes = [tiles_of(made, seen, each).packing.tiles[:, 3:].prod(1) for each in (0.05, 2.0, 1e6)]
     assert (sizes[0] >= sizes[1]).all() and sizes[0].sum() > 2 * sizes[1].sum() and (sizes[2] <= 16).all()
 
 
-def test_some_of_the_surfels_keep_their_texels(truth: BakeState) -> None:
+def test_some_of_the_surfels_keep_their_texels(truth: Trained) -> None:
     kept = torch.arange(60) % 3 > 0
     some = truth.only(kept)
     gone = dict(truth.scene.surfels)
@@ -118,7 +123,7 @@ def test_some_of_the_surfels_keep_their_texels(truth: BakeState) -> None:
     assert truth.only(torch.ones(60, dtype=torch.bool)) is truth
 
 
-def test_the_best_state_is_kept(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
+def test_the_best_state_is_kept(truth: Trained, wrong: Trained, views: list[View]) -> None:
     wild = replace(OPTIONS, rate=30.0, share=40.0, patience=2)
     perfect = [View(v.camera, render(wrong, v.camera)) for v in views]
     progress: list[tuple[int, int]] = []
@@ -132,7 +137,7 @@ def test_the_best_state_is_kept(truth: BakeState, wrong: BakeState, views: list[
 
 
 def test_steps_that_are_not_finite_are_survived(
-    wrong: BakeState, views: list[View], monkeypatch: pytest.MonkeyPatch
+    wrong: Trained, views: list[View], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     real, calls = losses.photometric, []
 
@@ -150,7 +155,7 @@ def test_steps_that_are_not_finite_are_survived(
     torch.testing.assert_close(given_up.texels, wrong.texels, rtol=0, atol=0)
 
 
-def test_masks_and_exposures(truth: BakeState, wrong: BakeState, views: list[View]) -> None:
+def test_masks_and_exposures(truth: Trained, wrong: Trained, views: list[View]) -> None:
     mask = torch.ones(40, 48, 1, dtype=torch.bool)
     mask[:, :24] = False
     spoilt = [View(v.camera, torch.where(mask, v.image, float("nan")), mask) for v in views]
@@ -167,7 +172,7 @@ def test_masks_and_exposures(truth: BakeState, wrong: BakeState, views: list[Vie
     "bad", [{"steps": 0}, {"val_every": 1}, {"rate": 0.0}, {"share": 0.0}, {"pixels_per_texel": 0.0}]
 )
 def test_options_out_of_range_are_refused_and_too_few_views_change_nothing(
-    wrong: BakeState, views: list[View], bad: dict[str, float]
+    wrong: Trained, views: list[View], bad: dict[str, float]
 ) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         partial(polish_scene, wrong, views, BACKGROUND)(replace(PolishOptions(), **bad))

@@ -14,8 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
 from bitymi_ns.bake import BakeOptions
-from bitymi_ns.bake.state import BakeState
-from bitymi_ns.bake.tiles import Tiles
+from bitymi_ns.bake.pipeline import trained_texels
 from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops.backend import emulated_cuda
@@ -234,9 +233,9 @@ def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: pytest.Mo
     surfels["beta_raw"] = torch.zeros(count)
     camera = Camera(torch.eye(4), torch.tensor([[64.0, 0, 32], [0, 64.0, 32], [0, 0, 1]]), size, size)
     bound = 0.0471 * 0.953**16.5  # between the weights of two fragments, so that 43 % show a texel
-    stands = SimpleNamespace(surfels=surfels, near=0.2, config=SimpleNamespace(weight_bound=bound))
-    tiles = Tiles(torch.full((count, 2), 4), torch.full((count,), 3.0), torch.zeros(16 * count, 3))
-    baked = BakeState.of(stands, surfels, torch.arange(count), tiles, BakeOptions(format="fp16"))
+    field = TexelField(torch.full((count, 2), 4), torch.full((count,), 3.0), torch.zeros(16 * count, 3))
+    stands = SimpleNamespace(surfels=surfels, field=field, near=0.2, config=SimpleNamespace(weight_bound=bound))
+    baked = trained_texels(stands, BakeOptions(format="fp16"))
     view = View(camera, torch.zeros(size, size, 3))
     monkeypatch.setattr("bitymi_ns.ops.coverage.PART", 1 << 12)  # large views have many parts
     taken = []

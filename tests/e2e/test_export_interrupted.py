@@ -47,7 +47,8 @@ def test_ctrl_c_leaves_nothing_half_written_and_the_message_names_what_is_there(
     if message == "was not written":
         assert list(tmp_path.iterdir()) == []
     else:
-        assert check_files(folder)[0] is not None
+        bundle = check_files(folder)[0]
+        assert bundle is not None and (bundle.info.statistics.held_out is None) == (module is command)
 
 
 @pytest.mark.parametrize(

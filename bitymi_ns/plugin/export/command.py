@@ -14,10 +14,8 @@ from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
 from bitymi_ns.bundle import BundleError, reserved_bundle
 from bitymi_ns.bundle.bake_options import BundleFormat
-from bitymi_ns.bundle.manifest import MANIFEST, dump
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.files import reason, write_file
 from bitymi_ns.interchange import (
     Frame,
     Kind,
@@ -198,14 +196,11 @@ class ExportAtlas(BakeOptions, CompactOptions):
             "loose_files": {CONFIG: bundle_config(config, self.output_dir, background)},
         }
         how = {"overwrite": self.overwrite, "interchange": self.interchange, "first": first, "background": background}
-        bundle = export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
-        if self.compare and len(datamanager.eval_dataset):
-            bundle.info.statistics.held_out = compare(model, datamanager, bundle.scene)
-            try:
-                write_file(self.output_dir / MANIFEST, dump(bundle.info))
-            except OSError as error:
-                why = reason(error, self.output_dir)
-                warn(f"The bundle {self.output_dir} is complete, but does not state how well it shows them: {why}.")
+        try:
+            if self.compare and len(datamanager.eval_dataset):
+                written["statistics"]["held_out"] = compare(model, datamanager, baked.scene).model_dump()
+        finally:  # a comparison that is interrupted leaves the bundle, without its result
+            bundle = export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
         print_summary(self.output_dir, bundle.info)
         self.print_size(download_bytes(self.output_dir, bundle.info))
         if self.extras:

@@ -112,7 +112,8 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
             results = finite_numbers({**value["results"], **times, "bundle_bytes": size})
             if "psnr" not in results:
                 raise KeyError("psnr among its results")
-            pictures = sorted((folder / value["pictures"]).glob("eval_img_*.png")) if value.get("pictures") else []
+            shown = folder / value["pictures"] if value.get("pictures") else None
+            pictures = sorted(shown.glob("eval_img_*.png")) if shown and os.path.isdir(shown) else []
         except (KeyError, TypeError, AttributeError, ValueError, OSError) as error:
             raise ReportError(f"{trained.source}: the {kind} cell of {trained.method} lacks {error}.") from error
         group = f"{trained.method}, {bundle}" if bundle else trained.method

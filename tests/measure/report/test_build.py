@@ -13,6 +13,9 @@ from PIL import Image
 
 from bitymi_ns.measure.report.page import build
 from bitymi_ns.measure.report.records import ReportError
+from bitymi_ns.safe_reading import open_regular
+from tests.changes import SPOILT
+from tests.measure.report.conftest import cell, figures, write_lines
 
 PLOTS = 12
 """Plots of three metrics against three costs, and of training curves."""
@@ -133,3 +136,22 @@ def test_foreign_page_is_not_replaced(eval_json, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(ReportError, match="file is not a folder: choose another path"):
         build([eval_json(psnr=20.0)], tmp_path / "file")
+
+
+@pytest.mark.parametrize("kind", SPOILT)
+def test_reports_of_what_is_no_file(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "in").mkdir()
+    SPOILT[kind](tmp_path / "in/eval.json")
+    SPOILT[kind](tmp_path / "in/eval_img_0001.png")
+    for given in (tmp_path / "in", tmp_path / "in/eval.json"):
+        with pytest.raises(ReportError, match="eval.json|nothing to report"):
+            build([given], tmp_path / "report")
+
+
+def test_names_in_a_report_that_no_file_can_have(tmp_path: Path) -> None:
+    """Found by scripts/fuzz.py."""
+    named = [cell("train", {"curve": "a" * 300}), cell("eval", figures(25.0, 30.0) | {"pictures": "a" * 300})]
+    cells = write_lines(tmp_path / "cells.jsonl", named)
+    assert build([cells], tmp_path / "cells").is_file()
+    with pytest.raises(OSError, match="no file can have this name"):
+        open_regular(tmp_path / "a\0")

@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, NoReturn, TextIO
 from rich.filesize import decimal
 
 from bitymi_ns.exit_messages import out_of_memory
-from bitymi_ns.trust import json_of
+from bitymi_ns.trust import LONGEST, json_of
 
 MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs need a tenth of it
 
@@ -88,7 +88,7 @@ def why(error: BaseException) -> str:
         return "it is nested too deeply"
     if isinstance(error, OverflowError):
         return "a number in it is too large"
-    return (str(error).strip() or type(error).__name__).splitlines()[0].rstrip(". ")
+    return (str(error).strip() or type(error).__name__).splitlines()[0][:LONGEST].rstrip(". ")
 
 
 @contextmanager

@@ -2,13 +2,14 @@ import math
 import struct
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import ExifTags, Image
 from PIL.TiffImagePlugin import IFDRational
 
-from bitymi_ns.capture.exif import Exif, exposure_settings, focal_length, read_exif
+from bitymi_ns.capture.exif import Exif, exposure_exif, exposure_settings, focal_length, read_exif
 from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.capture.sfm_photos import read_photo, upright_photos
 from bitymi_ns.progress import no_progress
@@ -170,3 +171,15 @@ def test_photographs_without_settings_or_that_cannot_be_read(tmp_path: Path) -> 
     cut.write_bytes(bare.read_bytes()[:30])
     stops = exposure_stops([bare, odd, cut, tmp_path / "none.jpg"])
     assert len(stops) == 4 and all(math.isnan(s) for s in stops)
+
+
+def test_exif_that_breaks_pillow_counts_as_none(tmp_path: Path) -> None:
+    """Its exposure pointer is a 64-bit number."""
+    entry = (0x8769).to_bytes(2, "little") + (16).to_bytes(2, "little") + (1).to_bytes(4, "little")
+    exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0" + entry + (26).to_bytes(4, "little") + bytes(4) + b"\xff" * 8
+    paths = [tmp_path / f"{i}.jpg" for i in range(2)]
+    for path in paths:
+        Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(path, exif=exif)
+    assert np.isnan(exposure_stops(paths)).all()
+    with Image.open(paths[0]) as image:
+        assert read_exif(image) == Exif() and not dict(exposure_exif(image))

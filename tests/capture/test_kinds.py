@@ -8,21 +8,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from bitymi_ns.capture import kinds
 from bitymi_ns.capture.folder_contents import images_of, passed_over, poses_in
-from bitymi_ns.capture.kinds import (
-    CLOUDS,
-    FOLDERS,
-    IMAGES_OF,
-    LISTS,
-    NSVF,
-    PICTURES,
-    POSES,
-    PROCESSED,
-    RENDERS,
-    RESULTS,
-    UNREAD,
-    Kind,
-)
+from bitymi_ns.capture.kinds import Kind
 from bitymi_ns.capture.points import Points, cloud_beside
 from bitymi_ns.capture.sfm_photos import find_photos
 from bitymi_ns.capture.splits import lists_by_name, read_split_lists
@@ -31,14 +19,14 @@ from tests.captures import write_cloud
 
 PAGE = Path(__file__).resolve().parents[2] / "docs/capture.md"
 TABLES = {
-    "Pictures": PICTURES,
-    "Folders": FOLDERS,
-    "Folders with": RESULTS,
-    "Not read": UNREAD,
-    "Poses, not read": POSES,
-    "Pictures of models": IMAGES_OF,
-    "Clouds": CLOUDS,
-    "Splits": (*LISTS, *NSVF, *PROCESSED),
+    "Pictures": kinds.PICTURES,
+    "Folders": kinds.FOLDERS,
+    "Folders with": kinds.RESULTS,
+    "Not read": kinds.UNREAD,
+    "Poses, not read": kinds.POSES,
+    "Pictures of models": kinds.IMAGES_OF,
+    "Clouds": kinds.CLOUDS,
+    "Splits": (*kinds.LISTS, *kinds.NSVF, *kinds.PROCESSED),
 }
 
 
@@ -64,7 +52,7 @@ def test_the_page_prints_the_table() -> None:
         assert line in page, textwrap.fill(line, 120, subsequent_indent="  ", break_on_hyphens=False)
 
 
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(PICTURES)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.PICTURES)))
 def test_pictures_that_are_no_photographs(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
     photograph, other = (each if "." in each[-4:] else f"{each}.png" for each in (whose or "photograph", name))
     save(tmp_path / other.upper())
@@ -74,7 +62,7 @@ def test_pictures_that_are_no_photographs(tmp_path: Path, row: Kind, name: str, 
     assert passed_over(tmp_path)[0].startswith(f"{other.upper()} ({row.what}")
 
 
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(FOLDERS)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.FOLDERS)))
 def test_folders_without_photographs(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
     save(tmp_path / name / "a.png")
     assert bool(find_photos(tmp_path)) == bool(row.of)
@@ -83,11 +71,11 @@ def test_folders_without_photographs(tmp_path: Path, row: Kind, name: str, whose
     assert passed_over(tmp_path)[0].startswith(f"{name} ({row.what}: 1")
 
 
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(RESULTS)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.RESULTS)))
 def test_results(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
     folder = tmp_path / "test"
     save(folder / "rgb/a.png")
-    if row is RENDERS:
+    if row is kinds.RENDERS:
         (folder / name).mkdir()
     else:
         assert find_photos(tmp_path)
@@ -95,7 +83,7 @@ def test_results(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
     assert not find_photos(tmp_path) and passed_over(tmp_path)[0].startswith(f"test ({row.what}: 1")
 
 
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(UNREAD)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.UNREAD)))
 def test_formats_that_are_not_read(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
     (tmp_path / name.upper()).touch()
     assert not find_photos(tmp_path)
@@ -103,7 +91,7 @@ def test_formats_that_are_not_read(tmp_path: Path, row: Kind, name: str, whose: 
 
 
 @pytest.mark.parametrize("below", ["", "deeper/"])
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(POSES)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.POSES)))
 def test_poses_of_other_programs(tmp_path: Path, row: Kind, name: str, whose: str, below: str) -> None:
     for each in ("a", "b"):
         save(tmp_path / f"images/{each}.png")
@@ -118,12 +106,12 @@ def test_poses_of_other_programs(tmp_path: Path, row: Kind, name: str, whose: st
     assert not {"FILE", "IMAGES", "FOLDER"} & {*found.replace("'", " ").split()}
 
 
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(IMAGES_OF)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.IMAGES_OF)))
 def test_pictures_of_a_model(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
     assert images_of(tmp_path / name)[0] == tmp_path / row.what.replace("NAME", "img")
 
 
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(CLOUDS)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.CLOUDS)))
 def test_clouds_that_nothing_names(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
     view = Photograph(Path(), ColmapCamera("PINHOLE", 8, 8, (8.0, 8.0, 4.0, 4.0)), np.eye(4), "")
     cloud = Points(np.random.default_rng(0).normal(size=(99, 3)), np.zeros((99, 3), np.uint8))
@@ -133,13 +121,13 @@ def test_clouds_that_nothing_names(row: Kind, name: str, whose: str, tmp_path: P
         assert (found is not None) is used
 
 
-@pytest.mark.parametrize(("row", "name", "whose"), list(of(LISTS)))
+@pytest.mark.parametrize(("row", "name", "whose"), list(of(kinds.LISTS)))
 def test_lists_of_splits(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("a.png\n")
     assert read_split_lists(tmp_path, tmp_path, []).names == {row.what: ["a.png"]}
 
 
-@pytest.mark.parametrize("rows", [NSVF, PROCESSED])
+@pytest.mark.parametrize("rows", [kinds.NSVF, kinds.PROCESSED])
 def test_names_of_splits(rows: tuple[Kind, ...]) -> None:
     files = {row.what: [name] for row, name, _ in of(rows)}
     assert lists_by_name([Path(*names) for names in files.values()], rows, "").names == files

@@ -221,19 +221,6 @@ def test_pictures_that_are_no_photographs_are_named(tmp_path: Path) -> None:
     assert find_photos(tmp_path) == ["rgb/1.jpg"]
 
 
-def test_pictures_among_photographs_that_are_none(tmp_path: Path) -> None:
-    for name in ("IMG_1.jpg", "depth_00001.png", "depth_00002.png", "conf_00001.png", "dynamic_mask_IMG_1.png"):
-        Image.new("L", (8, 8)).save(tmp_path / name)
-    for name in ("conf.png", "dynamic_mask_b.png"):  # of no photograph
-        Image.new("L", (8, 8)).save(tmp_path / name)
-    assert find_photos(tmp_path) == ["conf.png", "dynamic_mask_b.png", "IMG_1.jpg"]
-    assert passed_over(tmp_path) == [
-        "conf_00001.png (a confidence map)",
-        "depth_00001.png and 1 more (a depth map)",
-        "dynamic_mask_IMG_1.png (a mask of instant-ngp)",
-    ]
-
-
 @pytest.mark.parametrize("wrapped", ["room", "room/room"])
 def test_a_capture_in_a_folder_of_its_own(tmp_path: Path, wrapped: str) -> None:
     """As after unpacking an archive into a new folder."""

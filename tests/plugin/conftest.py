@@ -1,6 +1,8 @@
 """Small captures in nerfstudio's format."""
 
 import shutil
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,18 @@ def no_triangulation(monkeypatch: pytest.MonkeyPatch) -> None:
         raise CaptureError("not in this test")
 
     monkeypatch.setattr("bitymi_ns.capture.known_poses.triangulate", triangulate)
+
+
+@pytest.fixture
+def no_hang() -> Iterator[None]:
+    def stop(*_: Any) -> None:
+        pytest.fail("it waits for ever")  # not an Exception, which readers turn into a message
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
 
 
 @pytest.fixture

@@ -86,3 +86,14 @@ def test_a_long_run_says_at_the_start_when_it_will_end(
     assert printed.count("The run will end in about ") == 1 and printed.index("will end") < printed.index("step ")
     assert re.search(r"at \d\d:\d\d; --pipeline.datamanager.longest-side 30 takes half as long\.", printed)
     assert re.search(r"step +2 of 4: .* left\n", printed) and not re.search(r"step +4 of 4: .* left\n", printed)
+
+
+def test_names_do_not_control_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    console.say("a\x1b[2Jb [red]")
+    console.warn("\x9b")
+    assert (
+        "a\\x1b[2Jb [red]" in (text := " ".join(capsys.readouterr().out.split()))
+        and "\\x9b" in text
+        and "\x9b" not in text
+    )
+    assert str(InputError("\x1b]0;x\x07")) == "bitymi: \\x1b]0;x\\x07"

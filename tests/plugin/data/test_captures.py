@@ -4,7 +4,6 @@ import errno
 import os
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import psutil
 import pytest
@@ -18,7 +17,7 @@ from bitymi_ns.plugin.data.capture_checks import reporting_input_errors
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
-from tests.captures import edit, expect, images_of, load, printed
+from tests.captures import expect, images_of, load
 from tests.stand_in_card import CARD
 
 
@@ -99,34 +98,6 @@ def test_the_colour_behind_transparent_photographs() -> None:
     assert train_config_for(TrainConfig(background="white"), None, True).background == "white"
     assert train_config_for(TrainConfig(), None, True).background == "auto"
     assert train_config_for(TrainConfig(), None, False).background == "black"
-
-
-def test_few_views_and_one(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    edit(capture, lambda meta: meta.update(frames=meta["frames"][:5]))
-    assert len(load(capture).train_dataset) == 4
-    assert "Only 4 training views" in printed(capsys)
-    edit(capture, lambda meta: meta.update(frames=meta["frames"][:2]))
-    with expect("only one training view"):
-        load(capture)  # the other is held out
-    edit(capture, lambda meta: meta.update(frames=meta["frames"][:1]))
-    with expect("has one image only"):
-        load(capture)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"scale_factor": 0.0}, "--scale-factor is 0.0, but has to be above 0"),
-        ({"scale_factor": -1.0}, "--scale-factor is -1.0, but has to be above 0"),
-        ({"downscale_factor": 0}, "--downscale-factor is 0, but has to be 1 or more"),
-        ({"eval_mode": "fraction", "train_split_fraction": 2.0}, "--train-split-fraction is 2.0, .* at most 1"),
-        ({"eval_interval": 0}, "--eval-interval is 0, but has to be 1 or more"),
-    ],
-)
-def test_options_that_leave_no_capture(capture: Path, options: dict[str, Any], message: str) -> None:
-    with expect(message):
-        load(capture, **options)
-    assert len(load(capture, eval_mode="interval", train_split_fraction=2.0).train_dataset) == 10  # unused
 
 
 def test_a_file_without_permission_is_named(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -55,20 +55,6 @@ def test_colours_by_which_white_they_fit(project: Path, colours: tuple[str, str]
     assert model.rgb.tolist() == expected and not model.without_colors
 
 
-@pytest.mark.parametrize(
-    ("colours", "why"),
-    [("", "its points have none"), (" 0 0 0", "its own are all black"), (" 70000 0 -1", "between -1 and 70000")],
-)
-def test_points_without_colours_get_them_of_the_photographs(
-    project: Path, colours: str, why: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = points(project, f"0 0 0.5{colours}", f"0.1 0 0.4{colours}")
-    metadata = load_any(project).train_dataset.metadata
-    assert np.allclose(read_model(folder).xyz, [[0, 0, 0.5], [0.1, 0, 0.4]])
-    assert metadata["points3D_rgb"].shape == (2, 3) and metadata["points3D_rgb"].any()
-    assert f"The points of {folder} get the colors of the photographs" in (text := printed(capsys)) and why in text
-
-
 def test_two_forms_that_differ(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = project / "sparse/0"
     texts = {path.name: path.read_text() for path in folder.iterdir()}

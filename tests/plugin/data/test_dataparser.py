@@ -36,6 +36,7 @@ from tests.captures import (
     printed,
     reduce_photographs,
 )
+from tests.formats import instant_ngp
 
 
 def sides(of: Any) -> tuple[Any, Any, Any]:
@@ -138,6 +139,16 @@ def test_the_captures_own_lists_decide_what_is_held_out(capture: Path) -> None:
     assert len(other.train_dataset) == 11
 
 
+@pytest.mark.parametrize("given", ["train", "val", "test", "train val", "train test"])
+def test_one_list_is_enough(capture: Path, given: str) -> None:
+    names = [f"images/{path.name}" for path in images_of(capture)]
+    lists = {f"{split}_filenames": names[2:] if split == "train" else names[:2] for split in given.split()}
+    edit(capture, lambda meta: meta.update(lists))
+    manager = load(capture)
+    assert held_out(manager) == ["frame_00001.png", "frame_00002.png"]
+    assert len(manager.train_dataset) == 10
+
+
 def test_reduced_photographs_of_nerfstudio(capture: Path) -> None:
     reduce_photographs(capture, 2, (24, 18))
     one = load_any(capture, downscale_factor=2)
@@ -163,28 +174,6 @@ def test_names_that_are_held_out(capture: Path, capsys: pytest.CaptureFixture[st
     one = load_any(capture, eval_names=("images/frame_00003.png", "frame_00005.png"))
     assert held_out(one) == ["frame_00003.png", "frame_00005.png"]
     assert "2 of 12 photographs, by --eval-names (frame_00003.png, frame_00005.png)" in printed(capsys)
-    with expect("--eval-names: 1 of 2 names are of no photograph of the capture: frame_3.png"):
-        load_any(capture, eval_names=("frame_00003.png", "frame_3.png"))
-    with expect("no image is left for training .* all 12 are held out"):
-        load_any(capture, eval_names=tuple(path.name for path in images_of(capture)))
-
-
-def test_two_things_in_one_folder(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    colmap_model(capture, capture / "sparse/0")
-    load_any(capture)
-    text = printed(capsys)
-    assert "transforms.json (nerfstudio, 12 photographs). Not read: sparse/0 (`bitymi-data --format colmap`)." in text
-    load_any(capture, format="colmap")
-    text = printed(capsys)
-    assert f"Reading COLMAP model {capture}/sparse/0" in text
-    assert "Not read: transforms.json (`bitymi-data --format nerfstudio`)" in text
-
-
-@pytest.mark.parametrize("name", ["images_path", "alpha_color"])
-def test_options_that_are_for_something_else_are_refused(capture: Path, name: str) -> None:
-    assert OPTION_FORMATS.keys() <= BitymiDataParserConfig.__dataclass_fields__.keys()
-    with expect(f"--{name.replace('_', '-')} is not for"):
-        load_any(capture, **{name: None if name == "alpha_color" else Path("x")})
 
 
 def test_points_of_the_model_that_a_capture_was_made_of(capture: Path) -> None:
@@ -252,37 +241,29 @@ def test_one_file_of_held_out_views_is_enough(blender: Path) -> None:
 # instant-ngp
 
 
-@pytest.fixture
-def ngp(capture: Path) -> Path:
-    """The capture as instant-ngp writes it, frames unsorted and without extensions."""
-    frames = json.loads((capture / "transforms.json").read_text())["frames"][::-1]
-    for frame in frames:
-        frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
-    meta = {"w": 48, "h": 36, "camera_angle_x": 1.1, "aabb_scale": 2, "frames": frames}
-    (capture / "transforms.json").write_text(json.dumps(meta))
-    return capture
-
-
-def test_instant_ngps_transforms(ngp: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    one = load_any(ngp)
+def test_instant_ngps_transforms(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    instant_ngp(capture)
+    edit_frames(capture, lambda frame: frame.update(file_path=f"./{frame['file_path'].removesuffix('.png')}"))
+    one = load_any(capture)
     text = printed(capsys)
     assert "transforms.json (instant-ngp, 12 photographs)" in text
     assert "If nerfstudio wrote it: `bitymi-data --format nerfstudio`." in text
     assert held_out(one) == ["frame_00001.png", "frame_00009.png"]
     assert one.train_dataset.metadata["declares_box"] is True
-    assert one.train_dataset.scene_box.aabb.tolist() == [[-1.0] * 3, [1.0] * 3]
-    theirs = InstantNGPDataParserConfig(data=ngp, eval_mode="all").setup().get_dataparser_outputs("train")
+    assert one.train_dataset.scene_box.aabb.tolist() == [[-2.0] * 3, [2.0] * 3]
+    theirs = InstantNGPDataParserConfig(data=capture, eval_mode="all").setup().get_dataparser_outputs("train")
     places = {p.name: c[:, 3] for p, c in zip(theirs.image_filenames, theirs.cameras.camera_to_worlds, strict=True)}
     for path, pose in zip(one.train_dataset.image_filenames, one.train_dataset.cameras.camera_to_worlds, strict=True):
         same(places[path.name], pose[:, 3])
 
 
-def test_focal_lengths_of_instant_ngp(ngp: Path) -> None:
-    edit(ngp, lambda meta: meta.update(fl_x=40.0, fl_y=50.0))
-    cameras = load_any(ngp).train_dataset.cameras
+def test_focal_lengths_of_instant_ngp(capture: Path) -> None:
+    instant_ngp(capture)
+    edit(capture, lambda meta: meta.update(fl_x=40.0, fl_y=50.0, camera_angle_x=1.1))
+    cameras = load_any(capture).train_dataset.cameras
     assert (float(cameras.fx[0]), float(cameras.fy[0])) == (40.0, 50.0)
-    edit(ngp, lambda meta: (meta.pop("fl_x"), meta.pop("fl_y"), meta.update(camera_angle_y=0.9)))
-    fy = float(load_any(ngp).train_dataset.cameras.fy[0])
+    edit(capture, lambda meta: (meta.pop("fl_x"), meta.pop("fl_y"), meta.update(camera_angle_y=0.9)))
+    fy = float(load_any(capture).train_dataset.cameras.fy[0])
     assert fy == pytest.approx(18 / math.tan(0.45))
 
 
@@ -295,6 +276,7 @@ def parsed(*args: str) -> Any:
 
 
 def test_it_is_what_the_presets_read_with() -> None:
+    assert OPTION_FORMATS.keys() <= BitymiDataParserConfig.__dataclass_fields__.keys()
     assert isinstance(parsed(), BitymiDataParserConfig)
     given = parsed("bitymi-data", "--data", "x", "--eval-names", "a b.jpg", "\u00e4.jpg", "--downscale-factor", "4")
     assert given == BitymiDataParserConfig(data=Path("x"), eval_names=("a b.jpg", "\u00e4.jpg"), downscale_factor=4)

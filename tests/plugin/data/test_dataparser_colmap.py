@@ -104,15 +104,6 @@ def test_reduced_photographs_are_used_as_they_are(project: Path, size: tuple[int
     assert np.array_equal(image.numpy(), stored)  # not scaled again
 
 
-def test_reduced_photographs_of_another_size(project: Path) -> None:
-    reduce_photographs(project, 4, (24, 18))
-    with expect("images_4/frame_00001.png has 24 x 18 pixels, but its camera is for 48 x 36, of which 1/4 is 12 x 9"):
-        load_any(project, downscale_factor=4)
-    (project / "images_4/frame_00003.png").unlink()
-    with expect(r"1 of 12 photographs of .* are missing:\s+.*images_4/frame_00003.png"):
-        load_any(project, downscale_factor=4)
-
-
 @pytest.mark.parametrize(("ending", "reduction"), [(".png", 1), (".png.png", 2)])
 def test_masks_beside_the_photographs(project: Path, ending: str, reduction: int) -> None:
     save_masks(project, LEFT, ending=ending)
@@ -156,15 +147,6 @@ def test_smaller_copies_alone(project: Path) -> None:
     ):
         load_any(project)
     assert load_any(project, downscale_factor=2).cached_train[0]["image"].shape[:2] == (18, 24)
-
-
-def test_photographs_that_the_model_lacks_are_named(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for name in ("extra b.png", "extra a.png"):
-        Image.new("RGB", (48, 36)).save(project / "images" / name)
-    assert len(load_any(project).train_dataset) == 10
-    assert "2 of 14 photographs have no pose in the model and are left out: extra a.png, extra b.png." in printed(
-        capsys
-    )
 
 
 @pytest.mark.parametrize("name", ["input", "holiday 2024", "."])

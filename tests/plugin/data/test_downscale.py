@@ -1,6 +1,5 @@
 """Large photographs are reduced on reading: cameras, pictures, masks and messages agree."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -50,13 +49,6 @@ def test_odd_sizes_keep_the_rays_of_the_corners(capture: Path) -> None:
             for c in (a, b)
         ]
         assert rays[0] == pytest.approx(rays[1], abs=1e-5)
-
-
-def test_a_photograph_of_another_size_is_named_by_its_size_in_the_file(capture: Path) -> None:
-    frame = json.loads((capture / "transforms.json").read_text())["frames"][3]["file_path"]
-    Image.new("RGB", (40, 30), (9, 99, 199)).save(capture / frame)
-    with expect(f"{Path(frame).name} has 40 x 30 pixels, but its camera is for 48 x 36"):
-        _ = load(capture, 24).cached_train, load(capture, 24).cached_eval
 
 
 def test_transparent_photographs_keep_their_colours(tmp_path: Path, capture: Path) -> None:

@@ -186,19 +186,6 @@ def test_a_frame_that_is_listed_twice(capture: Path, capsys: pytest.CaptureFixtu
     assert "held-out photographs are" not in printed(capsys)
 
 
-def with_orientation(path: Path, image: Image.Image, value: int) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = value
-    image.save(path, exif=exif)
-
-
-def test_turned_photographs(capture: Path) -> None:
-    paths = images_of(capture)
-    with_orientation(paths[3], Image.open(paths[3]).rotate(90, expand=True), 6)
-    with expect(f"{paths[3].name} is turned by a quarter: it has 36 x 48 .* camera is for 48 x 36.*EXIF tag"):
-        _ = load(capture).cached_train
-
-
 def declared(path: Path, width: int, height: int) -> None:
     """Write a PNG header with this size, without pixels."""
     ihdr = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)

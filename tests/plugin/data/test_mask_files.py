@@ -10,16 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.captures import (
-    add_masks,
-    edit,
-    edit_frames,
-    expect,
-    images_of,
-    load_any,
-    printed,
-    save_masks,
-)
+from tests.captures import add_masks, edit, edit_frames, expect, images_of, load_any, printed, save_masks
 from tests.formats import colmap, instant_ngp, nerfstudio, polycam
 
 LEFT = np.uint8(np.arange(48) < 24)[None].repeat(36, 0) * 255
@@ -144,3 +135,27 @@ def test_pictures_that_nothing_names_are_named(
         assert "images_2" not in printed(capsys)
         load_any(place)
         assert "images_2 (reduced copies: 13; `bitymi-data --downscale-factor` uses them)" in printed(capsys)
+
+
+@pytest.mark.parametrize("place", ["masks\\", "/home/me/room/masks/", "D:\\room\\Masks\\"])
+def test_masks_by_their_names_on_another_machine(capture: Path, place: str) -> None:
+    save_masks(capture, lambda i: 255 if i else 0)
+    edit_frames(capture, lambda frame: frame.update(mask_path=f"{place}{Path(frame['file_path']).stem}.PNG"))
+    manager = load_any(capture)
+    assert manager.train_dataset.get_data(0)["mask"].all()
+    assert len(manager.eval_dataset) == 1  # the mask of the first photograph, which is held out, is black
+
+
+def test_masks_of_photographs_without_a_pose_are_nothing_to_speak_of(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    images = project / "sparse/0/images.txt"
+    images.write_text(images.read_text().partition("\n\n")[2])
+    for folder, ending in (("images", "_mask.png"), ("masks", ".png")):
+        for path in images_of(project)[:12]:
+            (project / folder).mkdir(exist_ok=True)
+            Image.fromarray(LEFT).save(project / folder / f"{path.stem}{ending}")
+        load_any(project)
+        assert "are used, of which black" in (text := printed(capsys)) and "Not taken for photographs" not in text
+        for path in project.glob("images/*_mask.png"):
+            path.unlink()

@@ -11,7 +11,7 @@ from bitymi_ns.capture.depth_normal_maps import read_depth
 from bitymi_ns.capture.scanner_views import _intrinsics
 from tests.capture.test_video import overwrite_packets
 from tests.captures import held_out, load_any, printed
-from tests.formats import SCANS, nsvf, scanner_app, scannet, seven_scenes, stray_scanner
+from tests.formats import SCANS, nsvf, scanner_app, seven_scenes, stray_scanner
 
 
 @pytest.mark.parametrize("layout", SCANS)
@@ -64,13 +64,6 @@ def test_nsvfs_names_are_its_split(capture: Path, capsys: pytest.CaptureFixture[
     for file in [*folder.glob("*/1_*"), *folder.glob("*/2_*")]:
         file.rename(file.with_name(f"0{file.name[1:]}"))
     assert held_out(load_any(folder)) == ["0_0000.png", "0_0008.png"]
-
-
-def test_a_pose_that_was_lost(capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = scannet(capture)
-    np.savetxt(folder / "pose/4.txt", np.full((4, 4), -np.inf))
-    assert len(load_any(folder, eval_mode="all").train_dataset) == 11
-    assert "1 photographs of" in printed(capsys)
 
 
 @pytest.mark.parametrize("damaged", [False, True])

@@ -12,17 +12,7 @@ from PIL import Image
 
 from bitymi_ns.capture.lens import FACES
 from bitymi_ns.plugin.data.views import photograph_files, with_lenses
-from tests.captures import (
-    as_binary,
-    colmap_model,
-    edit,
-    edit_frames,
-    expect,
-    held_out,
-    images_of,
-    load_any,
-    printed,
-)
+from tests.captures import as_binary, colmap_model, edit, edit_frames, expect, held_out, images_of, load_any, printed
 
 SIZE = (96, 48)
 

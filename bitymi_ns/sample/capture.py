@@ -37,14 +37,15 @@ class RoomView:
     height: int
 
     def rays(self, supersample: int = 1) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Compute the origin [3] and unit directions [H s, W s, 3] of rays through s by s subpixel centres."""
+        """Compute the origin [3, 1] and unit directions [3, H s W s] of rays through s by s subpixel centres."""
         h, w = self.height * supersample, self.width * supersample
         x = ((np.arange(w) + 0.5) / supersample - self.width / 2) / self.focal
         y = (self.height / 2 - (np.arange(h) + 0.5) / supersample) / self.focal
         d = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1)
         d = d @ self.camera_to_world[:3, :3].T
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
-        return self.camera_to_world[:3, 3].astype(np.float32), d.astype(np.float32)
+        rays = np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)
+        return self.camera_to_world[:3, 3:].astype(np.float32), rays
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -75,24 +76,19 @@ def camera_path(views: int, width: int, height: int, seed: int) -> list[RoomView
 
 def render(room: Room, view: RoomView, supersample: int = 3) -> NDArray[np.uint8]:
     """Render a view with antialiasing: [H, W, 3]."""
-    origin, directions = view.rays(supersample)
-    o = tuple(np.float32(a) for a in origin)
-    flat = directions.reshape(-1, 3)
-    color = np.empty_like(flat)
-    for start in range(0, len(flat), BAND):
-        d = tuple(np.ascontiguousarray(flat[start : start + BAND, a]) for a in range(3))
-        color[start : start + BAND] = room.color(o, d, room.hit(o, d))
+    o, directions = view.rays(supersample)
+    bands = np.split(directions, range(BAND, directions.shape[1], BAND), axis=1)
+    color = np.concatenate([room.color(o, d, room.hit(o, d)) for d in bands])
     color = color.reshape(view.height, supersample, view.width, supersample, 3).mean(axis=(1, 3))
     return (color * 255 + 0.5).astype(np.uint8)
 
 
 def first_hits(room: Room, view: RoomView, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], RoomHits]:
     """Trace the centres of pixels, flat indices [n]: world points [n, 3], and the hits."""
-    origin, directions = view.rays()
-    flat = directions.reshape(-1, 3)[pixels]
-    o = tuple(np.float32(a) for a in origin)
-    hits = room.hit(o, tuple(np.ascontiguousarray(flat[:, a]) for a in range(3)))
-    return origin + hits.t[:, None] * flat, hits
+    o, directions = view.rays()
+    d = directions.take(pixels, 1)
+    hits = room.hit(o, d)
+    return (o + hits.t * d).T, hits
 
 
 def sparse_points(

@@ -48,9 +48,8 @@ def room_of_tests() -> Room:
 
 def shaded(rays: np.ndarray, centre: tuple[float, float, float]) -> np.ndarray:
     room, flat = room_of_tests(), rays.reshape(-1, 3).astype(np.float32)
-    origin, direction = tuple(np.full(len(flat), c, np.float32) for c in centre), tuple(flat.T)
-    colours = np.asarray(room.color(origin, direction, room.hit(origin, direction)))
-    colours = colours if colours.shape[-1] == 3 else colours.T
+    origin, direction = np.float32(centre)[:, None], np.ascontiguousarray(flat.T)
+    colours = room.color(origin, direction, room.hit(origin, direction))
     return np.uint8(np.clip(colours, 0.0, 1.0) * 255.0 + 0.5).reshape(rays.shape)
 
 

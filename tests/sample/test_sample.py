@@ -93,7 +93,7 @@ def test_cameras_stand_in_the_room_upright_and_clear(meta: dict) -> None:
         matrix = np.array(frame["transform_matrix"])
         assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(matrix[:3, :3]) > 0
-        assert (matrix[:3, 3] > LOW + 0.1).all() and (matrix[:3, 3] < HIGH - 0.1).all()
+        assert (matrix[:3, 3:] > LOW + 0.1).all() and (matrix[:3, 3:] < HIGH - 0.1).all()
         assert matrix[2, 1] > 0.5, "up in the picture is up in the room"
     turned = look_at(np.array([0.0, -2.0, 0.0]), np.zeros(3))[:3, :3]
     assert np.allclose(turned, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -110,15 +110,14 @@ def test_sphere_mirrors() -> None:
 
     def seen(eye: list[float], point: np.ndarray) -> np.ndarray:
         d = point - np.array(eye)
-        d = np.float32(d / np.linalg.norm(d))
-        o = tuple(np.float32(a) for a in eye)
-        rays = tuple(np.array([a], np.float32) for a in d)
-        return room.color(o, rays, room.hit(o, rays))[0]
+        d = np.float32(d / np.linalg.norm(d))[:, None]
+        o = np.float32(eye)[:, None]
+        return room.color(o, d, room.hit(o, d))[0]
 
     a, b = [-1.5, -1.8, 1.2], [0.6, -1.9, 0.9]
     angles = np.linspace(-0.5, 1.3, 12)
     centre, radius, *_ = BALLS[SPHERE]
-    on_sphere = centre + radius * np.stack([0 * angles, -np.cos(angles), np.sin(angles)], axis=1)
+    on_sphere = centre.T + radius * np.stack([0 * angles, -np.cos(angles), np.sin(angles)], axis=1)
     assert np.mean([np.abs(seen(a, p) - seen(b, p)).max() for p in on_sphere]) > 0.08
     on_floor = np.array([0.3, -1.5, 0.0])
     assert np.abs(seen(a, on_floor) - seen(b, on_floor)).max() < 0.01

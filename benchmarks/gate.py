@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -130,16 +131,12 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
     config, background = TrainConfig(seed=seed), torch.zeros(3)
     cameras = [view.camera for view in capture.train]
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
-    calibrate = calibration.every(10)
-    _, train = calibration.timed(lambda: fit(scene, capture.train, [], config, SETTINGS["steps"], callback=calibrate))
+    train = partial(fit, scene, capture.train, [], config, SETTINGS["steps"], callback=calibration.every(10))
+    _, training = calibration.timed(train)
     trained, fragments, *_ = evaluate(scene, capture.views, config)
-
-    def make() -> Any:
-        refine = RefineOptions(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
-        calibrate = calibration.every(10)
-        return bake(scene, cameras, capture.train, background, BakeOptions(format="bc7"), refine, calibrate)
-
-    baked, baking = calibration.timed(make)
+    refine = RefineOptions(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
+    to = (BakeOptions(format="bc7"), refine, calibration.every(10))
+    baked, baking = calibration.timed(partial(bake, scene, cameras, capture.train, background, *to))
     with tempfile.TemporaryDirectory() as folder:
         bundle = Path(folder) / "bundle"
         export(baked, bundle)
@@ -151,18 +148,16 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
         units.append(unit)
         pair = image.rgb.clamp(0.0, 1.0), view.target(background, "cpu")
         quality.append(psnr(*pair))
-        try:
+        with suppress(lpips.LpipsUnavailable):  # reported by `main`
             distances.append(lpips.lpips(*pair, "alex"))
-        except lpips.LpipsUnavailable:  # reported by `main`
-            distances.append(math.nan)
     return {
         "psnr_trained": trained,
         "psnr_baked": statistics.fmean(quality),
-        "lpips_baked": statistics.fmean(distances),
+        "lpips_baked": statistics.fmean(distances or [math.nan]),
         "bundle_bytes": size,
         "surfels": len(scene),
         "fragments_per_pixel": fragments / (cameras[0].width * cameras[0].height),
-        "train": train,
+        "train": training,
         "bake": baking,
         "frame": statistics.median(units),
     }
@@ -171,8 +166,7 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
 def run_job(data: Path, downscale: int) -> dict[str, float]:
     """Measure the figures of one scene in this process: means over the seeds (minima of times), and peak memory."""
     torch.set_num_threads(int(THREADS["OMP_NUM_THREADS"]))
-    calibration = Calibration()
-    capture = load_capture(data, downscale=downscale)
+    calibration, capture = Calibration(), load_capture(data, downscale=downscale)
     seeds = [run_seed(capture, seed, calibration) for seed in range(SETTINGS["seeds"])]
     # other programs only ever add time
     found = means(seeds) | {key: min(f[key] for f in seeds) for key, limit in LIMITS.items() if limit.timed}
@@ -182,11 +176,18 @@ def run_job(data: Path, downscale: int) -> dict[str, float]:
     return found
 
 
-def in_a_process(data: Path, downscale: int) -> dict[str, float]:
-    """Run `run_job` in a new process, so that peak memory is the job's."""
+def measure(capture: Path | None) -> Scenes:
+    """Measure the room at 160 x 120, and a capture at half its size, each in a new process: peak memory is its own."""
     os.environ |= THREADS  # read when torch loads OpenMP
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        return process.submit(run_job, data, downscale).result()
+    found = {}
+    with tempfile.TemporaryDirectory() as folder:
+        jobs = [("room", generate(Path(folder) / "room", views=24, width=160, height=120, points=3000), 1)]
+        jobs += [] if capture is None else [(capture.name, capture.absolute(), 2)]
+        for name, *job in jobs:
+            say(f"gate: {name}")
+            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+                found[name] = process.submit(run_job, *job).result()
+    return found
 
 
 Line = tuple[str, str, list[str]]  # figure, verdict, cells of the table
@@ -218,19 +219,6 @@ def quicker(found: Scenes, again: Scenes) -> Scenes:
     """Take the figures of the first run, but the smaller times of both."""
     timed = [key for key, limit in LIMITS.items() if limit.timed]
     return {scene: {**f, **{key: min(f[key], again[scene][key]) for key in timed}} for scene, f in found.items()}
-
-
-def measure(capture: Path | None) -> Scenes:
-    """Measure the room at 160 x 120, and a capture at half its size."""
-    found = {}
-    with tempfile.TemporaryDirectory() as folder:
-        say("gate: the room")
-        room = generate(Path(folder) / "room", views=24, width=160, height=120, points=3000)
-        found["room"] = in_a_process(room, 1)
-    if capture is not None:
-        say(f"gate: {capture.name}")
-        found[capture.name] = in_a_process(capture.absolute(), 2)
-    return found
 
 
 def main() -> None:
@@ -266,9 +254,7 @@ def main() -> None:
             f"figures may be worse by {ELSEWHERE:g} times as much, because kernels round differently there."
         )
     if options.accept:
-        rounded = {
-            name: {k: round(v, 5) for k, v in figures.items() if not math.isnan(v)} for name, figures in found.items()
-        }
+        rounded = {name: {k: round(v, 5) for k, v in f.items() if not math.isnan(v)} for name, f in found.items()}
         # keep other captures' figures of the same job and processor model
         kept = baseline["scenes"] if {**baseline, "scenes": {}} == {**empty, "scenes": {}} else {}
         text = json.dumps({**empty, "scenes": {**kept, **rounded}}, indent=2, sort_keys=True)

@@ -30,8 +30,7 @@ RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0
 
 CAMERAS = 6  # held-out cameras to time
 RUNS = 50  # frames per camera
-Times = dict[int, list[Camera]]
-"""Multiple of the photographs' size -> cameras to time."""
+SIZES = (1, 2)  # multiples of the photographs' size to time
 Frames = Callable[[Camera], Callable[[], Tensor]]
 """Camera -> function that renders its view: [H, W, 3], or [H, W, 1] int32 with 8 bits per channel."""
 
@@ -76,16 +75,6 @@ def inferred(g: dict[str, Tensor]) -> Frames:
         return torch.inference_mode()(lambda: renderer.render(**view).frame[0, ..., :3])
 
     return make
-
-
-def load() -> tuple[Any, str]:
-    """Import gsplat; return the module, or None and the reason."""
-    try:
-        import gsplat
-        import gsplat.cuda._backend  # compiles the kernels if needed
-    except (ImportError, RuntimeError, OSError) as error:
-        return None, f"gsplat cannot be timed here: {error}"
-    return gsplat, ""
 
 
 def first_gaussians(capture: SplitCapture, most: int, extent: float) -> dict[str, Tensor]:
@@ -157,25 +146,20 @@ def train(
     return {name: value.detach().contiguous() for name, value in activated(parameters).items()}, seconds
 
 
-def picture(image: Tensor) -> Tensor:
-    """Convert a frame to [H, W, 3]."""
-    return image if image.is_floating_point() else image.view(torch.uint8)[..., :3] / 255
-
-
 def row(
-    name: str, count: int, took: float | None, draws: Callable[[], Frames], capture: SplitCapture, times: Times
+    name: str, count: int, took: float | None, draws: Callable[[], Frames], capture: SplitCapture, device: torch.device
 ) -> list[str]:
     """Measure the row of a renderer: primitives, seconds of training (None: not trained here), quality on the held-out
     views, and median milliseconds of a frame, averaged over cameras, by image size."""
-    device, make = next(iter(times.values()))[0].viewmat.device, draws()
-    good = means(
-        [
-            image_quality(picture(make(view.camera)()), view.target(None, device), view.mask)
-            for view in (view.to(device) for view in capture.held_out)
-        ]
-    )
+    make, qualities = draws(), []
+    for view in (view.to(device) for view in capture.held_out):
+        image = make(view.camera)()
+        rgb = image if image.is_floating_point() else image.view(torch.uint8)[..., :3] / 255
+        qualities.append(image_quality(rgb, view.target(None, device), view.mask))
+    good, every = means(qualities), max(1, len(capture.held_out) // CAMERAS)
+    cameras = [view.camera.to(device) for view in capture.held_out[::every][:CAMERAS]]
     options = Options(device, 5, RUNS)
-    frames = [fmean(device_milliseconds(make(camera), options) for camera in cameras) for cameras in times.values()]
+    frames = [fmean(device_milliseconds(make(camera.scaled(k)), options) for camera in cameras) for k in SIZES]
     say(f"{name}, {count:,}: {good['psnr']:.2f} dB, {', '.join(f'{ms:.3f} ms' for ms in frames)}")
     cells = [name, number(count, 0), number(took, 0), number(good["psnr"]), number(good["fitted_psnr"])]
     return [*cells, number(good["ssim"], 3), *(number(ms, 3) for ms in frames)]
@@ -188,38 +172,36 @@ def main(parser: Arguments, words: Sequence[str]) -> None:
     parser.add_argument("--steps", type=int, default=20_000, help="of training Gaussians (%(default)s)")
     parser.add_argument("--gaussians", type=Path, required=True, help="folder of the trained Gaussians")
     parser.add_argument("--bundles", nargs="*", type=Path, default=[], help="baked scenes of the same capture")
-    parser.add_argument("--times", nargs="+", type=int, default=[1, 2], help="sizes, of the photographs' (%(default)s)")
     parser.add_output()
     arguments = parser.parse_args(words)
     device = parser.device()
     capture = load_capture(arguments.data.expanduser())
-    gsplat, why = load()
+    try:
+        import gsplat
+        import gsplat.cuda._backend  # compiles the kernels if needed
+    except (ImportError, RuntimeError, OSError) as error:
+        parser.error(f"gsplat cannot be used here: {error}")
     if arguments.train:
-        if gsplat is None:
-            parser.error(f"--train needs gsplat: {why}")
         arguments.gaussians.mkdir(parents=True, exist_ok=True)
         for most in arguments.train:
             trained = train(gsplat, capture, most, arguments.steps, device)
             torch.save(trained, arguments.gaussians / f"{most}.pt")
             say(f"{most:,} Gaussians, {arguments.steps:,} steps: {trained[1]:.0f} s")
         return
-    camera, every = capture.held_out[0].camera, max(1, len(capture.held_out) // CAMERAS)
-    timed = [view.camera.to(device) for view in capture.held_out[::every][:CAMERAS]]
-    times = {k: [camera.scaled(k) for camera in timed] for k in arguments.times}
+    camera = capture.held_out[0].camera
     header = ("what draws", "primitives", "training s", "PSNR dB", "after affine fit", "SSIM")
-    header += tuple(f"ms at {k * camera.width} x {k * camera.height}" for k in times)
+    rows = Rows((*header, *(f"ms at {k * camera.width} x {k * camera.height}" for k in SIZES)))
     made: list[tuple[str, int, float | None, Callable[[], Frames]]] = []
     for folder in arguments.bundles:
         bundle = read_bundle(folder, decode=False)
         made.append((folder.name, len(bundle), None, partial(packed, bundle.scene.to(device))))
-    for file in sorted(arguments.gaussians.glob("*.pt")) if gsplat is not None else []:
+    for file in sorted(arguments.gaussians.glob("*.pt")):
         g, seconds = torch.load(file, map_location=device, weights_only=True)
         count = len(g["means"])
         made.append(("gsplat rasterization", count, seconds, partial(rasterized, gsplat, g)))
         made.append(("gsplat inference renderer", count, seconds, partial(inferred, g)))
-    rows = Rows(header)
-    notes = [f"Device: {torch.cuda.get_device_name(device)}.", *filter(None, [why])]
     about = f"{len(capture.train)} photographs of {camera.width} x {camera.height}; {len(capture.held_out)} held out."
     for name, count, took, make in made:
-        rows.add(f"{name}, {count:,}", partial(row, name, count, took, make, capture, times))
-        publish(f"Equal quality: {arguments.data.name}", f"{about}\n\n{rows}", notes, arguments.output)
+        rows.add(f"{name}, {count:,}", partial(row, name, count, took, make, capture, device))
+        title, notes = f"Equal quality: {arguments.data.name}", [f"Device: {torch.cuda.get_device_name(device)}."]
+        publish(title, f"{about}\n\n{rows}", notes, arguments.output)

@@ -12,7 +12,6 @@ import shlex
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -66,31 +65,17 @@ def stand_in(folder: Path) -> dict[str, str]:
     return {**os.environ, "PATH": programs, "PYTHONPATH": path, "COLUMNS": "200", "BITYMI_NO_DOWNLOAD": "1"}
 
 
-def card_memory() -> float | None:
-    """Read the memory in use on the first GPU, MB; None without a GPU."""
-    command = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "--id=0"]
-    with contextlib.suppress(OSError, ValueError):
-        return float(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
-    return None
-
-
 @contextlib.contextmanager
-def watched() -> Iterator[list[float]]:
-    """Sample the GPU memory in use five times a second."""
+def watched(folder: Path) -> Iterator[list[float]]:
+    """Sample the first GPU's memory in use, MB, five times a second; the list yielded has it afterwards."""
     seen: list[float] = []
-    over = threading.Event()
-
-    def watch() -> None:
-        while (used := card_memory()) is not None:
-            seen.append(used)
-            if over.wait(0.2):
-                return
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    yield seen
-    over.set()
-    thread.join()
+    command = ["nvidia-smi", "--query-gpu=memory.used", "--format=csv,noheader,nounits", "--id=0", "--loop-ms=200"]
+    with (folder / "card.txt").open("w+") as file, contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):
+            stack.callback(subprocess.Popen(command, stdout=file).terminate)
+        yield seen
+        file.seek(0)
+        seen += [float(line) for line in file if line.strip().isdigit()]
 
 
 class Commands:
@@ -105,13 +90,10 @@ class Commands:
         """Run a command and return True on success."""
         typed, log = [str(word) for word in words], self._folder / f"{len(self.rows)}.log"
         cost = None
-        with watched() as used:
-            try:
-                cost = run_measured(typed, log, cwd=self._folder, env=self._environment)
-            except BenchError as error:
-                say(str(error))
+        with watched(self._folder) as used, contextlib.suppress(BenchError):
+            cost = run_measured(typed, log, cwd=self._folder, env=self._environment)
         self.rows.append((shlex.join(typed), cost, max(used, default=None)))
-        say(f"{'failed' if cost is None else 'ended'}: {self.rows[-1][0][:150]}")
+        say(f"{'ended' if cost else 'failed, see ' + str(log)}: {self.rows[-1][0][:150]}")
         return cost is not None
 
 

@@ -8,6 +8,7 @@ A run is STEPS/REDUCTION: number of steps, and integer factor by which photograp
 to 60 minutes on one CPU core, or one to two on a GPU (--device cuda). Several commands with the same --work share the
 runs. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
 
+import collections
 import contextlib
 import csv
 import functools
@@ -26,7 +27,7 @@ from zlib import crc32
 
 import torch
 import yaml
-from harness import Arguments, image_quality, means, number, publish, say, table
+from harness import Arguments, image_quality, means, publish, say
 from matplotlib.lines import Line2D
 from scenes import SplitCapture, load_capture
 from torch import Tensor
@@ -38,7 +39,8 @@ from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, wit
 from bitymi_ns.measure.figure import COLORS, Panel, png
 from bitymi_ns.measure.machine import commit
 from bitymi_ns.measure.report.plots import METRICS, costs, pareto_panel
-from bitymi_ns.measure.report.records import Evaluation
+from bitymi_ns.measure.report.records import Evaluation, over_seeds
+from bitymi_ns.measure.report.tables import markdown_tables, quality_tables
 from bitymi_ns.plugin.run.metrics import LPIPS, lpips_metrics
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene import Scene
@@ -50,27 +52,9 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.preset import Loader, Preset, load_preset
 from bitymi_ns.train.views import View, eval_background
+from bitymi_ns.trust import finite_numbers
 
 RUNS = ("10000/4", "1500/2", "300/1")
-COLUMNS = {
-    "PSNR": ("psnr", 2),
-    "mean exposure": ("mean_exposure_psnr", 2),
-    "fitted": ("fitted_psnr", 2),
-    "carried": ("carried_psnr", 2),
-    "refined": ("refined_psnr", 2),
-    "SSIM": ("ssim", 4),
-    "LPIPS": ("lpips", 4),
-    "LPIPS, VGG": ("lpips_vgg", 4),
-    "rollbacks": ("rollbacks", 0),
-    "surfels": ("surfels", 0),
-    "fragments per pixel": ("fragments", 1),
-    "CPU s": ("cpu_seconds", 0),
-    "s": ("seconds", 0),
-    "peak MB": ("peak_megabytes", 0),
-    "bundle dB": ("baked_psnr", 2),
-    "kB": ("kilobytes", 0),
-    "bake s": ("bake_seconds", 0),
-}
 
 
 @dataclass(frozen=True)
@@ -231,26 +215,25 @@ def bundle(
     return found | quality(lambda camera: baked.render(camera.to(device), background), held_out, background)
 
 
-def tables(runs: Sequence[LongRun], cells: Cells) -> str:
-    """Format a table per capture and kind of run: a line per row, means over seeds, standard deviation of the PSNR."""
-    parts = []
-    for group, members in itertools.groupby(runs, lambda run: (run.data, run.steps, run.reduction)):
-        lines, size = [], ""
-        for row, seeds in itertools.groupby(members, lambda run: run.row):
-            found = [cell["value"] for run in seeds if (cell := cells.get(run.key)) is not None]
-            if not found:
-                continue
-            size = f"{found[0]['width']} x {found[0]['height']}"
-            line = [row, str(len(found))]
-            for name, digits in COLUMNS.values():
-                values = [value[name] for value in found if value.get(name) is not None]
-                text = number(statistics.fmean(values), digits) if values else ""
-                spread_ = f" ± {statistics.stdev(values):.2f}" if name == "psnr" and len(values) > 1 else ""
-                line.append(text + spread_)
-            lines.append(line)
-        title = f"### {Path(group[0]).name}, {group[1]:,} steps, {size}\n\n"
-        parts.append(title + table(["row", "seeds", *COLUMNS], lines))
-    return "\n\n".join(parts)
+def evaluations(runs: Sequence[LongRun], cells: Cells) -> list[Evaluation]:
+    """List the figures of finished runs and of their bundles as `bitymi report` takes them; a capture with a length and
+    a size is a scene."""
+    rows = []
+    for run in runs:
+        if (cell := cells.get(run.key)) is None:
+            continue
+        value = finite_numbers(cell["value"])
+        title = f"{Path(run.data).resolve().name}, {run.steps:,} steps, {value['width']:g} x {value['height']:g}"
+        value |= {"fragments_per_pixel": value["fragments"], "train_seconds": value["seconds"]}
+        value |= {"train_cpu_seconds": value["cpu_seconds"], "train_peak_bytes": 1e6 * value["peak_megabytes"]}
+        seeds = {"run": f"{run.row} {run.seed}", "series": run.row, "seed": run.seed}
+        rows.append(Evaluation(title, run.row, False, run.row, value, "", Path(run.data), group=run.row, **seeds))
+        curve = cell["value"].get("curve", [])
+        for i, point in enumerate(curve, 1):
+            label = f"{run.row}, bundle{f' {i}' if len(curve) > 1 else ''}"
+            figures = point | {"bundle_bytes": 1e3 * point["kilobytes"]}
+            rows.append(Evaluation(title, run.row, True, label, figures, "", Path(run.data), group=label, **seeds))
+    return rows
 
 
 PUBLISHED = Path(__file__).with_name("published.csv")
@@ -258,28 +241,22 @@ PUBLISHED = Path(__file__).with_name("published.csv")
 pictures."""
 
 
-def draw_curves(runs: Sequence[LongRun], cells: Cells) -> bytes:
-    """Plot PSNR and LPIPS of the bundles of every run against their bytes, and what others publish of the same scenes;
-    return a PNG file."""
-    rows = []
-    for run in runs:
-        value, scene = cells.get(run.key)["value"], Path(run.data).resolve().name
-        method = f"{run.row}, {run.steps:,} steps, {value['width']} x {value['height']}"
-        for point in value["curve"]:
-            figures = {**point, "bundle_bytes": 1e3 * point["kilobytes"]}
-            rows.append(Evaluation(scene, method, True, method, figures, "", Path()))
-    scenes = sorted({row.scene for row in rows})
+def draw_curves(rows: list[Evaluation]) -> bytes:
+    """Plot PSNR and LPIPS of bundles against their bytes, and what others publish of the same scenes; return a PNG
+    file."""
+    rows, scenes = [row for row in rows if row.baked], dict.fromkeys(row.scene for row in rows)
     with open(PUBLISHED, newline="", encoding="utf8") as file:
-        for row in csv.DictReader(file):
-            if row["scene"] in scenes:
+        for row, scene in itertools.product(list(csv.DictReader(file)), scenes):
+            if scene.startswith(f"{row['scene']},"):
                 method = f"{row['program'].split()[0]}, published, {row['pictures']}"
                 figures = {"psnr": float(row["psnr"]), "bundle_bytes": float(row["bytes"])}
-                rows.append(Evaluation(row["scene"], method, True, method, figures, "", Path()))
+                rows.append(Evaluation(scene, method, True, method, figures, "", Path()))
     colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(dict.fromkeys(row.method for row in rows))}
     size, panels = costs(rows)[-1], []
     for scene, key in itertools.product(scenes, ("psnr", "lpips")):
         shown = [row for row in rows if row.scene == scene and key in row.results]
-        draw = functools.partial(pareto_panel, rows=shown, key=key, cost=size, colors=colors, markers={"": "o"})
+        markers = collections.defaultdict(lambda: "o")
+        draw = functools.partial(pareto_panel, rows=shown, key=key, cost=size, colors=colors, markers=markers)
         panels.append(Panel(draw, scene, size.label, METRICS[key][0]))
     return png(panels, [Line2D([], [], color=color, label=name) for name, color in colors.items()], most=2)
 
@@ -306,11 +283,13 @@ def main() -> None:
             start = time.perf_counter()
             value = measure(run)
             cells.add(run.key, without_nan(value), provenance(sys.argv, time.perf_counter() - start))
-            say(", ".join(f"{name} {value[of]:.4g}" for name, (of, _) in COLUMNS.items() if of in value))
+            say(", ".join(f"{name} {figure:.4g}" for name, figure in finite_numbers(value).items()))
     cells.refresh()
-    publish("Long and short runs", tables(runs, cells), (), arguments.output)
+    rows = evaluations(runs, cells)
+    tables = markdown_tables(quality_tables(over_seeds(rows), training=True))
+    publish("Long and short runs", "\n\n".join(tables), (), arguments.output)
     if arguments.plot is not None:
-        arguments.plot.write_bytes(draw_curves(runs, cells))
+        arguments.plot.write_bytes(draw_curves(rows))
 
 
 def read_arguments() -> Namespace:

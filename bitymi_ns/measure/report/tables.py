@@ -87,6 +87,8 @@ COLUMNS = (
 )
 FITTED = (
     Column("PSNR, mean exposure", "mean_exposure_psnr", "{:.2f}".format, "up"),
+    Column("PSNR carried", "carried_psnr", "{:.2f}".format, "up"),
+    Column("PSNR refined", "refined_psnr", "{:.2f}".format, "up"),
     Column("PSNR fitted", "fitted_psnr", "{:.2f}".format, "up"),
     Column("SSIM fitted", "fitted_ssim", "{:.3f}".format, "up"),
     Column("LPIPS fitted", "fitted_lpips", "{:.3f}".format, "down"),
@@ -115,8 +117,9 @@ NOTES = (
     "ms: rendering alone, warmed up; FPS = 1000 / ms (the fps of ns-eval also times metrics and files, so it is not "
     "shown). 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation of the PSNR over seeds. "
     "Fitted: each half of a view after the affine map of its colours that fits the other half to the photograph, so "
-    "that exposure and white balance do not count. Mean exposure: drawn with the mean of the photographs' exposures, "
-    "the others with the exposure interpolated from the neighbouring photographs. Bold: best of its scene."
+    "that exposure and white balance do not count. Carried, refined: held-out poses moved as the nearest photographs' "
+    "were, or aligned to the scene. Mean exposure: drawn with the mean of the photographs' exposures, the others with "
+    "the exposure interpolated from the neighbouring photographs. Bold: best of its scene."
 )
 
 

@@ -6,6 +6,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from bitymi_ns.exit_messages import out_of_memory
+
 from .backend import Pool, function, kernel, kernel_class, module
 from .capacity import TooManyFragments
 from .fragment_list import Layout, empty_ids, empty_list
@@ -40,14 +42,19 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
         layout, and the numbers of `Fragments` by name.
 
     Raises:
-        TooManyFragments: there are more than `most`.
+        TooManyFragments: there are more than `most`, or, with a limit, than memory holds.
     """
     most = MOST if most == 0 else most or 0
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), **projection.alpha_arrays, most=most)
         if most and n > most:
             raise TooManyFragments(geom, projection, n, most, ids=False)
-        found = empty_list(geom, n)
+        try:
+            found = empty_list(geom, n)
+        except RuntimeError as error:  # of torch's allocator
+            if not most or not out_of_memory(error):
+                raise
+            raise TooManyFragments(geom, projection, n, n // 2, ids=False) from error
         arrays = _empty_layout(tracer.tiles, tracer.blocks)
         tracer.copy(**found, **arrays)
     return _layout(arrays, projection.camera.width, projection.camera.height), found

@@ -39,8 +39,9 @@ MARGIN = 1.1  # factor by which other views may have more fragments
 PROGRAM = 800e6  # bytes of Python, libraries, and a capture's cameras and points
 FREED = 500e6
 """Bytes of freed blocks, each too small to be returned, that are kept for later views; less for small ones, which take
-`KEPT_LISTS` times their lists and pictures so."""
+`KEPT_LISTS` times their lists and pictures so, and more for large ones, `KEPT_LISTS` times their pictures."""
 KEPT_LISTS = 2
+MOST_KEPT = 2.8e6  # pixels of a picture whose colours are such a block; those of larger ones are returned
 PER_SHADED_FRAGMENT = 60
 """Further bytes with a hash-grid field: surfels and pixels of fragments, points, residuals and their gradients."""
 PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes on a card in lists of training
@@ -99,7 +100,8 @@ def state_training(
         kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 3 * total)  # at half size
     view = PER_PIXEL * pixels
     view += _per_fragment(scene, PER_CARD_FRAGMENT if lists else PER_PASSING_FRAGMENT) * fragments
-    needed = kept + view + (0 if card else min(KEPT_LISTS * view, FREED))
+    freed = max(FREED, KEPT_LISTS * PER_PIXEL * min(pixels, MOST_KEPT))
+    needed = kept + view + (0 if card else min(KEPT_LISTS * view, freed))
     surfels = max(len(scene), most_surfels)
     grown = PER_SURFEL * surfels
     if texels is not None:  # they begin after the error prune

@@ -25,7 +25,7 @@ def mesh_of(load_config: Path, folder: Path, **options: object) -> open3d.geomet
 def place(bundle: Path, transform: np.ndarray) -> None:
     """Move the bundle within the capture's frame."""
     info = read_bundle(bundle).info
-    info.world = info.world.model_copy(update={"transform": transform.tolist()})
+    info.world = info.world.replace(transform=tuple(map(tuple, transform.tolist())))
     (bundle / "bundle.json").write_bytes(dump(info))
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bitymi_ns.files import write_file
-from bitymi_ns.trust import finite_numbers, printable
+from bitymi_ns.trust import printable
 
 if TYPE_CHECKING:  # slow to import
     import pycolmap
@@ -21,47 +21,36 @@ FILES = (VALUES, PAGE, PICTURE, "frame.json")  # of a report; frame.py writes th
 MOST_POINTS = 20_000  # most points in the plot, drawn at random
 
 
-def write_report(folder: Path, values: Mapping[str, object], model: pycolmap.Reconstruction) -> None:
+def write_report(folder: Path, values: Mapping[str, Any], model: pycolmap.Reconstruction) -> None:
     """Write the report without frame.json: `values`, a page, and a plot of a model with z up."""
     from matplotlib import style
 
     write_file(folder / VALUES, (json.dumps(values, indent=2, ensure_ascii=False) + "\n").encode())
     write_file(folder / PAGE, _page(values).encode())
     with style.context("default"):  # a matplotlibrc in the current folder may ask for LaTeX
-        _draw(folder / PICTURE, model, values.get("metres_per_unit") is not None)
-
-
-def overview(values: Mapping[str, Any]) -> dict[str, str]:
-    """Format statistics of report.json; a dash stands for what is no number."""
-    numbers = {key: values[key] for key in finite_numbers(values)}  # integers stay integers
-    stages = finite_numbers(values["seconds"]) if isinstance(values["seconds"], dict) else {}
-    seconds = [f"{stage} {value:.1f}" for stage, value in stages.items()]
-
-    def text(key: str, form: str) -> str:
-        return form.format(numbers[key]) if key in numbers else "–"
-
-    metres = "metres_per_unit" in numbers
-    up = values.get("up") or ("gps" if metres else "cameras")  # earlier reports state none
-    world = {"gps": "z up by GPS", "gravity": "z up by gravity"}.get(str(up), "z up by the cameras")
-    error = f" (median error {numbers['gps_error']:.1f} m)" if "gps_error" in numbers else ""
-    return {
-        "Photographs with a pose": f"{text('registered', '{:,}')} of {text('given', '{:,}')}",
-        "Mean reprojection error, pixels": text("reprojection_error", "{:.3f}"),
-        "Mean track length, photographs per point": text("track_length", "{:.2f}"),
-        "Points": text("points", "{:,}"),
-        "Median parallax, degrees": text("parallax_degrees", "{:.1f}"),
-        "Matches that contradict the poses": text("contradicted", "{:.1%}"),
-        "Up, scale": f"{world}, metres by GPS{error}" if metres else f"{world}, scale not known",
-        "Seconds": ", ".join(seconds),
-    }
+        _draw(folder / PICTURE, model, values["metres_per_unit"] is not None)
 
 
 def _page(values: Mapping[str, Any]) -> str:
+    world = {"gps": "z up by GPS", "gravity": "z up by gravity", "cameras": "z up by the cameras"}[values["up"]]
+    error, scale = values["gps_error"], "scale not known"
+    if values["metres_per_unit"] is not None:
+        scale = "metres by GPS" if error is None else f"metres by GPS (median error {error:.1f} m)"
+    statistics = {
+        "Photographs with a pose": f"{values['registered']:,} of {values['given']:,}",
+        "Mean reprojection error, pixels": f"{values['reprojection_error']:.3f}",
+        "Mean track length, photographs per point": f"{values['track_length']:.2f}",
+        "Points": f"{values['points']:,}",
+        "Median parallax, degrees": f"{values['parallax_degrees']:.1f}",
+        "Matches that contradict the poses": f"{values['contradicted']:.1%}",
+        "Up, scale": f"{world}, {scale}",
+        "Seconds": ", ".join(f"{stage} {value:.1f}" for stage, value in values["seconds"].items()),
+    }
     cameras = [(c["model"], ", ".join(f"{p:.5g}" for p in c["params"]), c["prior"]) for c in values["cameras"]]
     parts = [
         "# Camera poses",
         f"Source: {_cell(values['source'])}",
-        _table(("", ""), overview(values).items()),
+        _table(("", ""), statistics.items()),
         f"![cameras and points, from above and from the side]({PICTURE})",
     ]
     if values["left_out"]:

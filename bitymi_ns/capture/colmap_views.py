@@ -98,7 +98,7 @@ def _find_folder(
     folders += bases
 
     def most(path: Path, count: Callable[[Path], int]) -> int:
-        copies = path.with_name(f"{path.name}_{downscale}")
+        copies = Path(f"{path}_{downscale}")
         return max((count(each) for each in (path, copies) if each.is_dir()), default=0)
 
     portable = [name for name in names if leads_inside(name)]

@@ -214,7 +214,8 @@ def images_of(model: Path) -> list[Path]:
     """List the folders of pictures that belong to a COLMAP model by the table, the likeliest first."""
     path, found = os.path.abspath(model), ((_pattern(row.names), row.what) for row in kinds.IMAGES_OF)
     matches = [(pattern.match(path), what) for pattern, what in found]
-    return [Path(what.replace("NAME", next(filter(None, match.groups())))) for match, what in matches if match]
+    folders = [what.replace("NAME", next(filter(None, match.groups()))) for match, what in matches if match]
+    return [Path(os.path.normpath(model / os.path.relpath(each, path))) for each in folders]  # relative if `model` is
 
 
 def refusal(folder: Path) -> str:

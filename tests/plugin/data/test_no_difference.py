@@ -206,3 +206,20 @@ def test_what_is_said(
     options = change(place / file if file else place)
     load_any(data, **(options if isinstance(options, dict) else {}))
     assert printed(capsys).count(said) == 1
+
+
+@pytest.mark.parametrize("data", [".", "../room"])
+@pytest.mark.parametrize("form", PHOTOGRAPHS)
+def test_a_capture_is_read_from_within_as_from_elsewhere(
+    capture: Path,
+    form: Callable[[Path], Path],
+    data: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    form(capture)
+    (capture / "notes").mkdir()
+    Image.new("RGB", (8, 8)).save(capture / "notes/board.png")
+    monkeypatch.chdir(capture)
+    assert len(load_any(Path(data)).train_dataset) == 10
+    assert f"pictures of {Path(data) / 'notes'} that nothing names (board.png)" in printed(capsys)

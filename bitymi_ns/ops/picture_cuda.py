@@ -23,8 +23,8 @@ class PhotographTarget:
         mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
         background: [3] colour behind the picture; None: black, or the picture contains it.
         ssim_weight: w of (1 - w) L1 + w (1 - SSIM).
-        falloff_weight: weight of the mean of omega beta, omega = exp(-gamma e).
-        gamma: decay of omega with the error e, the sum of absolute differences over rgb.
+        falloff_weight: weight of the mean of omega beta, omega = exp(-falloff_gamma e).
+        falloff_gamma: decay of omega with the error e, the sum of absolute differences over rgb.
     """
 
     target: Tensor
@@ -32,7 +32,7 @@ class PhotographTarget:
     background: Tensor | None
     ssim_weight: float
     falloff_weight: float
-    gamma: float
+    falloff_gamma: float
 
     def check(self, like: Tensor, size: tuple[int, ...]) -> None:
         """Raise a ValueError unless shapes fit a picture [H, W] = `size`, the mask is bool and devices are `like`'s."""
@@ -54,9 +54,9 @@ class PhotographTarget:
             "background": None if self.background is None else dense(self.background, like),
             "correction": None if correction is None else dense(correction, like),
             "corrected": 0 if correction is None else correction.numel(),
-            "share": self.ssim_weight,
-            "weight": self.falloff_weight,
-            "gamma": self.gamma,
+            "ssim_weight": self.ssim_weight,
+            "falloff_weight": self.falloff_weight,
+            "falloff_gamma": self.falloff_gamma,
         }
 
 
@@ -87,23 +87,9 @@ class _PictureLosses(torch.autograd.Function):
         return dimage, None
 
 
-def picture_losses(
-    image: Tensor,
-    target: Tensor,
-    ssim_weight: float,
-    falloff_weight: float,
-    gamma: float,
-    mask: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+def picture_losses(image: Tensor, photograph: PhotographTarget) -> tuple[Tensor, Tensor]:
     """Compute the photometric and the weighted falloff loss of a picture (`train.losses.objective`), two scalars.
-
-    Args:
-        image: [H, W, 5] rgb, alpha and beta on a CUDA device, at least as large as a window of SSIM.
-        target: [H, W, 3] photograph.
-        ssim_weight: w of (1 - w) L1 + w (1 - SSIM).
-        falloff_weight: weight of the mean of omega beta, omega = exp(-gamma e).
-        gamma: decay of omega with the error e, the sum of absolute differences over rgb.
-        mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
+    `image`: [H, W, 5] rgb, alpha and beta on a CUDA device, at least as large as a window of SSIM.
 
     Raises:
         ValueError: shapes or devices do not agree.
@@ -111,7 +97,6 @@ def picture_losses(
     """
     if image.dim() != 3 or image.shape[-1] != IMAGE_CHANNELS:
         raise ValueError(f"the picture is {list(image.shape)}, not [H, W, {IMAGE_CHANNELS}]")
-    photograph = PhotographTarget(target, mask, None, ssim_weight, falloff_weight, gamma)
     photograph.check(image, tuple(image.shape[:2]))
     return _PictureLosses.apply(image, photograph)
 

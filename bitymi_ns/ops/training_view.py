@@ -6,6 +6,7 @@ The results are those of `project`, `view_color`, `rasterize_image`, `train.view
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -29,11 +30,15 @@ class ComparedView:
     Attributes:
         photometric, falloff: the weighted losses, scalars.
         projection: projected surfels.
+        depth, normal, soft_overdraw: as in `scene.RenderOutput`: there are none.
     """
 
     photometric: Tensor
     falloff: Tensor
     projection: Projection
+    depth: ClassVar[None] = None
+    normal: ClassVar[None] = None
+    soft_overdraw: ClassVar[None] = None
 
 
 @dataclass

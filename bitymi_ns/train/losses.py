@@ -11,7 +11,8 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.picture_cuda import picture_losses
+from bitymi_ns.ops.picture_cuda import PhotographTarget, picture_losses
+from bitymi_ns.ops.training_view import ComparedView
 from bitymi_ns.train.config import LossConfig
 
 if TYPE_CHECKING:
@@ -26,14 +27,14 @@ SSIM_WINDOW = 11  # side of the SSIM window in pixels; narrower images have no v
 
 
 def objective(
-    output: RenderOutput,
+    output: RenderOutput | ComparedView,
     target: Tensor,
     config: LossConfig,
     mask: Tensor | None = None,
     depth: Tensor | None = None,
     normal: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Compute the weighted terms of the objective, which is their sum.
+    """Compute the weighted terms of the objective, which is their sum, on every device and however the view was drawn.
 
     Args:
         output: rendered view of H x W pixels; with `soft_overdraw` if the overdraw loss is on.
@@ -45,16 +46,9 @@ def objective(
         `photometric`; `falloff` unless its weight is 0; `overdraw` if the view was rendered with `soft_overdraw`;
         `depth` and `normal` if used and their weights are not 0.
     """
-    image = output.image
-    if image is not None and fused_losses(config, image):
-        both = picture_losses(image, target, config.ssim_weight, config.falloff_weight, config.falloff_gamma, mask)
-        return dict(zip(("photometric", "falloff"), both[: 1 + (config.falloff_weight > 0.0)], strict=False))
-    terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
-    if config.falloff_weight > 0.0 or output.soft_overdraw is not None:
-        omega = error_weight(output.rgb, target, config.falloff_gamma, mask)
-    if config.falloff_weight > 0.0:
-        terms["falloff"] = config.falloff_weight * mean_where_right(omega, output.beta, mask)
+    terms = _picture_terms(output, target, config, mask)
     if output.soft_overdraw is not None:
+        omega = error_weight(output.rgb, target, config.falloff_gamma, mask)
         terms["overdraw"] = config.overdraw_weight * mean_where_right(omega, output.soft_overdraw, mask)
     if output.depth is not None and depth is not None and config.depth_weight > 0.0:
         weight = config.depth_weight * config.geometry_interval
@@ -63,6 +57,31 @@ def objective(
         weight = config.normal_weight * config.geometry_interval
         terms["normal"] = weight * normal_error(output.normal, output.alpha, normal, mask)
     return terms
+
+
+def _picture_terms(
+    output: RenderOutput | ComparedView, target: Tensor, config: LossConfig, mask: Tensor | None
+) -> dict[str, Tensor]:
+    """Compute the terms that every view has, for which there are CUDA kernels: `photometric` and `falloff`."""
+    with_falloff = config.falloff_weight > 0.0
+    if isinstance(output, ComparedView):
+        both = output.photometric, output.falloff
+    elif output.image is not None and fused_losses(config, output.image):
+        both = picture_losses(output.image, photograph_target(target, config, mask))
+    else:
+        first = photometric(output.rgb, target, config.ssim_weight, mask)
+        if not with_falloff:
+            return {"photometric": first}
+        omega = error_weight(output.rgb, target, config.falloff_gamma, mask)
+        both = first, config.falloff_weight * mean_where_right(omega, output.beta, mask)
+    return {"photometric": both[0], "falloff": both[1]} if with_falloff else {"photometric": both[0]}
+
+
+def photograph_target(
+    target: Tensor, config: LossConfig, mask: Tensor | None, background: Tensor | None = None
+) -> PhotographTarget:
+    """Make the argument of the CUDA kernels for the losses of `_picture_terms`."""
+    return PhotographTarget(target, mask, background, config.ssim_weight, config.falloff_weight, config.falloff_gamma)
 
 
 def fused_losses(config: LossConfig, image: Tensor) -> bool:

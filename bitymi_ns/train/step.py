@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
-from bitymi_ns.ops.picture_cuda import PhotographTarget
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
+from bitymi_ns.scene.scene import RenderOutput
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
-from bitymi_ns.train.losses import fused_losses, objective
+from bitymi_ns.train.losses import fused_losses, objective, photograph_target
 from bitymi_ns.train.messages import memory_reached
 from bitymi_ns.train.optimizers import ResizeHook, set_rate
 from bitymi_ns.train.poses import Poses
@@ -35,7 +35,7 @@ from bitymi_ns.train.views import DownscaledViews, TrainingData, View, at_size, 
 if TYPE_CHECKING:
     from bitymi_ns.ops.project import Projection
     from bitymi_ns.ops.training_view import ComparedView
-    from bitymi_ns.scene.scene import RenderOutput, Scene
+    from bitymi_ns.scene.scene import Scene
 
 TIMED_VIEWS = 2  # views that tell what a step takes at another size
 
@@ -67,18 +67,10 @@ def view_losses(
     overdraw_half = loss.overdraw_half if schedule.overdraw_counts(step) else None
     compared: ComparedView | None = None
     if not maps and overdraw_half is None and fused_losses(loss, target):
-        weights = (loss.ssim_weight, loss.falloff_weight, loss.falloff_gamma)
-        photograph = PhotographTarget(target, view.mask, background, *weights)
+        photograph = photograph_target(target, loss, view.mask, background)
         compared = scene.compare(view.camera, photograph, view.correction, field_mode)
-    if compared is not None:
-        terms = {"photometric": compared.photometric}
-        if loss.falloff_weight > 0.0:
-            terms["falloff"] = compared.falloff
-        watch.note(scene, step, terms)
-        return terms, compared
-    output = scene.render(view.camera, background, field_mode, maps, overdraw_half)
-    shown = output
-    if view.correction is not None:
+    output = shown = compared or scene.render(view.camera, background, field_mode, maps, overdraw_half)
+    if view.correction is not None and isinstance(output, RenderOutput):  # the other one is corrected already
         rgb = view.shown(output.rgb, output.alpha, background)
         image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
         shown = replace(output, rgb=rgb, image=image)

@@ -85,7 +85,7 @@ template <class S> __global__ void __launch_bounds__(kThreads) sums_kernel(Pictu
   const int64_t step = int64_t(gridDim.x) * kThreads;
   for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < p.pixels(); i += step) {
     if (!counts(p, i)) continue;
-    const Error<S> e = error_at(of, p.gamma, i);
+    const Error<S> e = error_at(of, p.falloff_gamma, i);
     own[0] += double(e.l1), own[1] += double(e.omega * p.image[i * kImageChannels + 4]), own[2] += 1;
   }
   add_up(own, total);
@@ -105,8 +105,8 @@ __global__ void __launch_bounds__(kThreads)
   const double count = own[2] > 1 ? own[2] : 1;
   const S l1 = S(own[0] / (3.0 * count)), right = S(own[1] / count);
   *of.counted = S(count);
-  *photometric = (S(1) - p.share) * l1 + p.share * (S(1) - *of.similarity);
-  *falloff = p.weight * right;
+  *photometric = (S(1) - p.ssim_weight) * l1 + p.ssim_weight * (S(1) - *of.similarity);
+  *falloff = p.falloff_weight * right;
 }
 
 template <class S, bool kCorrected>
@@ -115,8 +115,8 @@ __global__ void __launch_bounds__(kThreads)
                     const S* __restrict__ dfalloff, S* __restrict__ dimage) {
   constexpr int kSums = kCorrected ? PictureSpace<S>::kCorrected : 1;
   double own[kSums] = {};
-  const S l1 = *dphotometric * (S(1) - p.share) / (S(3) * *of.counted), similar = *dphotometric * p.share;
-  const S right = *dfalloff * p.weight / *of.counted;
+  const S l1 = *dphotometric * (S(1) - p.ssim_weight) / (S(3) * *of.counted), similar = *dphotometric * p.ssim_weight;
+  const S right = *dfalloff * p.falloff_weight / *of.counted;
   const int64_t step = int64_t(gridDim.x) * kThreads;
   for (int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x; i < p.pixels(); i += step) {
     S* to = dimage + i * kImageChannels;
@@ -124,7 +124,7 @@ __global__ void __launch_bounds__(kThreads)
       for (int k = 0; k < kImageChannels; ++k) to[k] = S(0);
       continue;
     }
-    const Error<S> e = error_at(of, p.gamma, i);
+    const Error<S> e = error_at(of, p.falloff_gamma, i);
     const S* from = p.image + i * kImageChannels;
     S d[3], dalpha = S(0);
     BT_UNROLL

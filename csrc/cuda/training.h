@@ -12,13 +12,13 @@ namespace bt::cuda {
 // [height, width, 3]; mask [height, width], 0 for pixels that do not count, null: all count. background [3] is the
 // colour behind the scene, null: black. correction maps the scene's colour to the photograph's, see
 // `train.views.View`: gains [3] or matrix and offset [3, 4]; null: none. The losses are those of
-// `train.losses.objective`: l1 is the mean of |shown - target|, right that of omega beta, omega = exp(-gamma e),
-// e = |shown - target| summed over rgb. The forward pass leaves in `workspace` what the backward pass reads.
+// `train.losses.objective`: l1 is the mean of |shown - target|, right that of omega beta, omega = exp(-falloff_gamma
+// e), e = |shown - target| summed over rgb. The forward pass leaves in `workspace` what the backward pass reads.
 template <class S> struct Picture {
   int height, width, corrected;  // numbers of the correction: 0, 3 or 12
   const S *image, *target, *background, *correction;
   const uint8_t* mask;
-  S gamma, share, weight;
+  S ssim_weight, falloff_weight, falloff_gamma;
   Workspace workspace;
 
   BT_HD int64_t pixels() const { return int64_t(height) * width; }
@@ -36,12 +36,13 @@ template <class S> struct Picture {
     if (corrected != 0 && corrected != 3 && corrected != 12) r.refuse("a correction has 3 or 12 numbers");
     r.maybe("correction", correction, corrected);
     if (!corrected != !correction) r.refuse("the correction's numbers are missing");
-    r.numbers("gamma", gamma, "share", share, "weight", weight);
+    r.numbers("ssim_weight", ssim_weight, "falloff_weight", falloff_weight, "falloff_gamma", falloff_gamma);
   }
 };
 template <class S> int64_t picture_workspace(int height, int width);
 
-// Writes photometric = (1 - share) l1 + share (1 - SSIM) and falloff = weight times `right` above; [1] each.
+// Writes photometric = (1 - ssim_weight) l1 + ssim_weight (1 - SSIM) and falloff = falloff_weight times `right` above;
+// [1] each.
 template <class S> struct PictureLoss {
   Picture<S> picture;
   S *photometric, *falloff;

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.picture_cuda import accumulate_statistics, picture_losses
+from bitymi_ns.ops.picture_cuda import PhotographTarget, accumulate_statistics, picture_losses
 from bitymi_ns.ops.project import Projection
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import RenderOutput
@@ -26,6 +26,10 @@ def picture(height: int, width: int, dtype: torch.dtype) -> tuple[Tensor, Tensor
     return image, target
 
 
+def photograph(target: Tensor, mask: Tensor | None = None) -> PhotographTarget:
+    return PhotographTarget(target, mask, None, 0.2, 0.5, 4.0)
+
+
 @DTYPES
 @pytest.mark.parametrize("size", [(11, 11), (37, 70)])
 def test_losses_and_gradient(size: tuple[int, int], dtype: torch.dtype, device: torch.device, cpu) -> None:
@@ -36,7 +40,7 @@ def test_losses_and_gradient(size: tuple[int, int], dtype: torch.dtype, device: 
         return [value.detach().cpu().double() for value in (*both, found)]
 
     drawn = image.to(device).requires_grad_()
-    got = gradient(drawn, picture_losses(drawn, target.to(device), 0.2, 0.5, 4.0))
+    got = gradient(drawn, picture_losses(drawn, photograph(target.to(device))))
     with cpu():
         image = image.double().requires_grad_()
         target = target.double()
@@ -75,7 +79,7 @@ def test_losses_and_gradient_where_a_mask_counts(share: float, dtype: torch.dtyp
 def test_one_loss_alone_has_a_gradient(device: torch.device) -> None:
     image, target = (value.to(device) for value in picture(12, 13, torch.float32))
     image.requires_grad_()
-    only, _ = picture_losses(image, target, 0.2, 0.5, 4.0)
+    only, _ = picture_losses(image, photograph(target))
     (found,) = torch.autograd.grad(only, image)
     assert found[..., :3].any() and not found[..., 3:].any()
 
@@ -83,12 +87,12 @@ def test_one_loss_alone_has_a_gradient(device: torch.device) -> None:
 def test_shapes_are_checked(device: torch.device) -> None:
     image, target = (value.to(device) for value in picture(12, 13, torch.float32))
     with pytest.raises(ValueError, match="the photograph"):
-        picture_losses(image, target[1:], 0.2, 0.5, 4.0)
+        picture_losses(image, photograph(target[1:]))
     with pytest.raises(ValueError, match="the picture is"):
-        picture_losses(image[..., :4], target, 0.2, 0.5, 4.0)
+        picture_losses(image[..., :4], photograph(target))
     for mask in (target[..., 0], target[1:, :, 0] > 0.5):
         with pytest.raises(ValueError, match="its mask"):
-            picture_losses(image, target, 0.2, 0.5, 4.0, mask=mask)
+            picture_losses(image, photograph(target, mask))
 
 
 @DTYPES

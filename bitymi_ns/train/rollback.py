@@ -44,9 +44,14 @@ class RollbackGuard:
     """Rollback guard of a run; `factor` is that of all learning rates, 1 before the first of its `rollbacks`."""
 
     def __init__(
-        self, scene: Scene, optimizers: Mapping[str, Optimizer], strategy: Strategy, exposure: Exposure, poses: Poses,
+        self,
+        scene: Scene,
+        optimizers: Mapping[str, Optimizer],
+        strategy: Strategy,
+        exposure: Exposure,
+        poses: Poses,
         announce: Callable[[str], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
         self.exposure, self.poses, self.announce = exposure, poses, announce
         self.schedule, self.config, self.processes = strategy.schedule, strategy.config, strategy.processes

@@ -172,12 +172,11 @@ class Scene(nn.Module):
             TooManyFragments: a single row of screen tiles has too many.
         """
         p = self.surfels
-        projection = project(*(p[name] for name in GEOMETRY), camera, self.near)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
+        alpha = None if self.field is None else self.field.opacity(bound, learns)
+        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, alpha=alpha)
         texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode)
-        if self.field is not None:
-            projection.alpha = self.field.opacity(bound, learns)
         base = self.base_color(projection)
         if texture is not None:
             image, marks = rasterize_image(projection, base, **texture, rim=self.config.rim)

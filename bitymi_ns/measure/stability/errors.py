@@ -169,9 +169,8 @@ def _signs(like: Tensor, generator: torch.Generator) -> Tensor:
 def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, way: Way) -> _Result:
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
-    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, near)
-    if way.alpha:
-        projection.alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0)
+    alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0) if way.alpha else None
+    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, near, alpha=alpha)
     fragments = ops.trace(projection, way.rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}

@@ -8,10 +8,12 @@ for CUDA tensors.
 from __future__ import annotations
 
 import io
+import os
+import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 import torch.distributed as dist
@@ -171,3 +173,12 @@ def raise_process_lost() -> Iterator[None]:
             raise
         message = (str(error).strip().splitlines() or [type(error).__name__])[0]
         raise ProcessLost(f"another process of the run has ended, or does not answer ({message})") from error
+
+
+def leave(status: int) -> NoReturn:
+    """End this process at once after another was lost: threads of gloo that still wait for it may abort the interpreter
+    as it shuts down."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(status)

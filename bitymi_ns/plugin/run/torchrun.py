@@ -20,7 +20,7 @@ import torch
 import torch.distributed as dist
 
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail
-from bitymi_ns.train.processes import ALONE, Processes, ProcessLost, raise_process_lost
+from bitymi_ns.train.processes import ALONE, Processes, ProcessLost, leave, raise_process_lost
 from bitymi_ns.trust import python_command
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ def work() -> None:
         train_loop(0, 1, config)
     except InputError as error:
         if isinstance(error.__cause__, ProcessLost):  # `run` names the process
-            sys.exit(LOST)
+            leave(LOST)
         raise
 
 

@@ -40,9 +40,9 @@ def png(panels: Sequence[Panel], legend: Sequence[Line2D] = (), most: int = 3) -
     FigureCanvasAgg(figure)
     for i, panel in enumerate(panels):
         axes = figure.add_subplot(rows, columns, i + 1)
+        panel.draw(axes)
         axes.xaxis.set_major_formatter(NUMBERS)
         axes.yaxis.set_major_formatter(NUMBERS)
-        panel.draw(axes)
         axes.grid(True, color=GRID, linewidth=0.8)
         axes.set_axisbelow(True)
         axes.tick_params(labelsize=8, length=3, which="both")
@@ -66,5 +66,4 @@ def log_when_wide(axes: Axes, values: Sequence[float]) -> None:
         axes.set_xscale("log")
         narrow = math.log10(max(values) / min(values)) < 2
         axes.xaxis.set_major_locator(LogLocator(base=10, subs=(1, 2, 5) if narrow else (1,), numticks=12))
-        axes.xaxis.set_major_formatter(NUMBERS)
         axes.xaxis.set_minor_formatter(NullFormatter())

@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.measure import markdown
@@ -185,6 +186,7 @@ def _panel(sweep: Sweep, rows: Sequence[SceneErrors], axes: Axes) -> None:
     for (_, color, style), values in zip(LINES, columns, strict=True):
         axes.plot(sweep.values, [max(value, LOWEST) for value in values], style, color=color, ms=4, lw=1.3)
     axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(numticks=5))
     axes.set_yscale("log")
     axes.set_ylim(LOWEST / 2, 30)
     if sweep.values[-1] < sweep.values[0]:

@@ -257,9 +257,8 @@ class _Reader:
         found = self.found
         photographs, source = scanner_photographs(found), str(found.path)
         photographs = self._prepared(photographs, found.folder)
-        named = [each.file for each in photographs]
         what = f"{source} ({found.format}, {len(photographs)} photographs with their poses)"
-        photographs = self._checked(what, photographs, named, source)
+        photographs = self._checked(what, photographs, (), source)
         points = self._points(None, photographs, source)
         files = [each.file for each in photographs] if found.format == "pose-files" else []
         lists = lists_by_name(files, NSVF, "NSVF's names")
@@ -298,7 +297,7 @@ class _Reader:
         self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None], source: str
     ) -> list[Photograph]:
         """Report what is read; fail if photographs or masks are missing. If it came with poses, report pictures beside
-        the `named` ones, and give photographs the poses that they are meant to have; see `as_meant`."""
+        them that are not `named`, and give photographs the poses that they are meant to have; see `as_meant`."""
         text = f"Reading {what}. {self.found.how_to_choose()}"
         if self.found.format == "instant-ngp" and self.options.format == "auto":  # a guess: both use one name
             text = f"{text.rstrip()} If nerfstudio wrote it: `bitymi-data --format nerfstudio`."
@@ -310,7 +309,8 @@ class _Reader:
         if self.found.format in ("photographs", "video"):
             return list(photographs)
         if self.need_photos:
-            name_unused(self.found, named, [each.mask for each in photographs], self.options.downscale_factor)
+            named, masks = (*named, *(each.file for each in photographs)), [each.mask for each in photographs]
+            name_unused(self.found, named, masks, self.options.downscale_factor)
         convention, asked = CONVENTIONS.get(self.found.format, (Reading(), np.eye(4))), self.options.poses_as
         asked = asked if asked != AUTO or self.need_photos else WRITTEN
         meant, self.mirror, self.poses_as = as_meant(photographs, *convention, source, asked)

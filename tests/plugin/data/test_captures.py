@@ -105,15 +105,9 @@ def test_a_file_without_permission_is_named(capture: Path, monkeypatch: pytest.M
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(capture / "images"))
 
     monkeypatch.setattr(BitymiDataManagerConfig, "setup", denied)
-    with expect(f"{capture / 'images'} cannot be read or written: you have no permission for it"):
-        with reporting_input_errors(BitymiDataManagerConfig(data=capture)):
-            BitymiDataManagerConfig(data=capture).setup()
-
-
-def test_a_capture_without_permission_is_a_capture_error(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def denied(*_: object) -> None:
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(capture))
-
     monkeypatch.setattr("bitymi_ns.capture.read.recognise", denied)
-    with pytest.raises(CaptureError, match=f"{capture} cannot be read or written: you have no permission for it"):
+    line = f"{capture / 'images'} cannot be read or written: you have no permission for it"
+    with expect(line), reporting_input_errors(BitymiDataManagerConfig(data=capture)):
+        BitymiDataManagerConfig(data=capture).setup()
+    with pytest.raises(CaptureError, match=line):
         load_capture(capture)

@@ -155,10 +155,6 @@ def test_without_points_photographs_are_compared(capture, room, capsys, monkeypa
 
 
 def test_depth_that_cannot_be_read_is_refused(capture) -> None:
-    with expect(r"depth_\d+.npy has 32 x 48 pixels"):
-        load(capture(lambda z, _: z[:, ::2]))
-    with expect("no map of numbers, but declares"):
-        load(capture(lambda z, _: z[0]))
     with expect("has 3 channels"):
         load(capture(lambda z, i: np.stack([z, z + 1, z], -1)))
     folder = capture()

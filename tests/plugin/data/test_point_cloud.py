@@ -11,7 +11,7 @@ from bitymi_ns.capture.points import read_cloud
 from bitymi_ns.plugin.run.model import new_scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
-from tests.captures import load, printed, refused
+from tests.captures import refused
 
 HEADER = (
     "ply\nformat {}\ncomment by hand\nelement vertex {}\n"
@@ -111,11 +111,3 @@ def test_colors_that_are_no_bytes(tmp_path: Path, format: str, kind: str, white:
     values = bytes_of * (white / 255) if kind != "ushort" else bytes_of.astype(int) * 257
     points, without = read_cloud(colored(tmp_path / "a.ply", kind, values, format), "")
     assert np.array_equal(points.rgb, bytes_of) and not without
-
-
-def test_colors_of_unknown_scale(tmp_path: Path, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points, without = read_cloud(write(tmp_path / "a.ply", bytes(45)), "")
-    assert len(points.rgb) == 0 and without == "its points have none"
-    colored(capture / "sparse_pc.ply", "float", np.float32([[-1, 0, 2000]] * 9), "ascii")
-    load(capture)
-    assert "get the colors of the photographs that see them: its colors lie between -1 and 2000" in printed(capsys)

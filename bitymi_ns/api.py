@@ -34,6 +34,7 @@ from bitymi_ns.ops import (
     trace,
 )
 from bitymi_ns.ops.backend import on_same_device
+from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.constants import BETA_MAX, COLOR_BIAS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
@@ -97,6 +98,7 @@ def _view(source: tuple[Photograph, Lens]) -> View:
     return View(camera, torch.from_numpy(pixels_of(image)), counts, file=photograph.file)
 
 
+@memory_errors()
 def rasterize(
     means: Tensor,
     quats: Tensor,
@@ -135,6 +137,7 @@ def rasterize(
         ValueError: a shape, dtype or device does not fit, a scale, opacity or beta is out of its range, or the camera
             has skew.
         TooManyFragments: those of a single row of screen tiles do not fit into memory; a larger view is drawn in bands.
+        MemoryError: the picture does not fit.
     """
     on_same_device(means, scales=scales, opacities=opacities, betas=betas)
     _check_ranges(

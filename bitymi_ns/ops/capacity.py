@@ -1,5 +1,7 @@
 """Fragments that fit into memory, and the error of a view that has more."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import torch
@@ -43,6 +45,17 @@ class TooManyFragments(RuntimeError):
             "surfels"
         )
         self.count, self.most = count, most
+
+
+@contextmanager
+def memory_errors() -> Iterator[None]:
+    """Raise MemoryError, as the kernels do, where torch raises RuntimeError because a CPU's memory is full."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "DefaultCPUAllocator" not in str(error):
+            raise
+        raise MemoryError(f"the picture does not fit into memory: {error}") from error
 
 
 def free_memory(device: torch.device) -> int:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.baked import DrawCache, common_size, draw, packed
+from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 
 from .camera import Camera
@@ -133,6 +134,7 @@ class BakedScene:
         return len(self.tiles)
 
     @torch.no_grad()
+    @memory_errors()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
         """Render a view. Texels are fetched bilinearly, clamped to the tile's outer texel centres. Samples per pixel
         follow the scale of the view (`sampling`); overdraw is the sum over the samples of a pixel.

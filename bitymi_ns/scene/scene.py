@@ -25,6 +25,7 @@ from bitymi_ns.ops import (
     trace,
     view_color,
 )
+from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.constants import IMAGE_CHANNELS
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.picture_cuda import PhotographTarget
@@ -149,6 +150,7 @@ class Scene(nn.Module):
         center = projection.camera.exact_center
         return view_color(self.config.view_color, self.surfels, means, center, projection.visible)
 
+    @memory_errors()
     def render(
         self,
         camera: Camera,
@@ -170,6 +172,7 @@ class Scene(nn.Module):
 
         Raises:
             TooManyFragments: a single row of screen tiles has too many.
+            MemoryError: the picture does not fit into memory.
         """
         p = self.surfels
         field = None if field_mode == "off" else self.field

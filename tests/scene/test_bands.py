@@ -1,5 +1,7 @@
 """Views with more fragments than allowed are drawn in bands: same image and gradients, less memory."""
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 
@@ -75,6 +77,28 @@ def test_memory_bounds_a_list_where_nothing_else_does(monkeypatch: pytest.Monkey
     bands.assert_same(got, want)
     found = list(ops.fitting_lists(parts.projection))
     assert len(found) > 1 and all(len(f) <= 1500 for f in found)
+
+
+REFUSED = "[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory"  # torch's words
+
+
+def test_a_list_that_memory_does_not_hold_is_drawn_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole, want = bands.step(CPU, 0)
+    allocate = trace_cpu.empty_list
+
+    def scarce(like: torch.Tensor, count: int) -> dict[str, torch.Tensor]:
+        if count > 1500:
+            raise RuntimeError(REFUSED)
+        return allocate(like, count)
+
+    monkeypatch.setattr(trace_cpu, "empty_list", scarce)
+    parts, got = bands.step(CPU, 0)
+    assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Bands)
+    bands.assert_same(got, want)
+    scene, camera = bands.make(CPU, 0)
+    monkeypatch.setattr(scene_module, "blended_image", Mock(side_effect=RuntimeError(REFUSED)))
+    with pytest.raises(MemoryError, match="the picture does not fit into memory: .*can't allocate memory"):
+        scene.render(camera)
 
 
 def test_training_goes_on() -> None:

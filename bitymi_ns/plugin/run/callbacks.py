@@ -17,6 +17,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
 from torch.nn import Parameter
 
+from bitymi_ns import exit_messages
 from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.files import reason, write_errors_as, write_file
 from bitymi_ns.ops.backend import give_back_memory
@@ -116,8 +117,11 @@ class TrainingRun:
         sizes = {schedule.resolution_factor(later) for later in range(step, self.total)}
         if len(sizes) < 2 or self.scene.surfels["means"].is_cuda:
             return
-        with suppress(TrainingDiverged, MemoryError):  # those end a run only where its own steps raise them
+        try:
             self.forecast.compare_sizes(step, {size: self.training.seconds_at(size) for size in sorted(sizes)})
+        except (TrainingDiverged, MemoryError, RuntimeError) as error:  # a run ends where its own steps raise these
+            if not isinstance(error, TrainingDiverged) and not exit_messages.out_of_memory(error):
+                raise
         give_back_memory()
 
     def _say_end(self, step: int) -> None:

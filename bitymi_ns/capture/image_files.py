@@ -169,16 +169,16 @@ def check_sizes(photographs: Sequence[Photograph]) -> None:
     whole = [each for each in photographs if not each.downscaled]
     for each, size in zip(whole, in_threads(lambda each: image_size(each.file), whole), strict=True):
         if size not in (None, each.camera.size):  # unreadable ones are reported when they are read
-            fail(wrong_size(each.file, size, each.camera.size))
+            fail(wrong_size(each.file, size, each.camera.size, each.label))
 
 
 _REPLACE = "Replace it or remove it from the capture."
 _WORDED = (FileNotFoundError, Image.DecompressionBombError)
 
 
-def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int]) -> str:
+def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int], camera: str = "its camera") -> str:
     """Explain that an image's `size` (width, height) is not the one `declared` by its camera."""
-    shown = f"{size[0]} x {size[1]} pixels, but its camera is for {declared[0]} x {declared[1]}"
+    shown = f"{size[0]} x {size[1]} pixels, but {camera} is for {declared[0]} x {declared[1]}"
     if size == declared[::-1]:
         turn = "If an EXIF tag turns it for viewers, turn its pixels: `mogrify -auto-orient <photos>`"
         return f"the image {path} is turned by a quarter: it has {shown}. {turn}. Else swap w and h, and cx and cy."

@@ -59,8 +59,7 @@ class RollbackGuard:
         self.factor, self.rollbacks = 1.0, 0
         self._limit = math.nan  # loss of blank images, or of the initial scene
         self._views = 0  # number of training views
-        # on the scene's device, to avoid synchronisation: sum of losses, largest count of surfels that are not finite
-        self._sum, self._broken, self._count = torch.zeros(()), torch.zeros(1, dtype=torch.int32), 0
+        self._sum, self._count = torch.zeros(()), 0  # of losses, on the scene's device to avoid synchronisation
         self._states: list[tuple[int, dict[str, Any]]] = []  # (step, state); the older one is known to be good
 
     def state_dict(self) -> dict[str, Any]:
@@ -118,29 +117,18 @@ class RollbackGuard:
             raise error
         return self._repair(step, cause)
 
-    def after(self, step: int, loss: Tensor, broken: Tensor) -> dict[str, float]:
-        """Check for divergence and roll back if needed, after each step's optimisers and strategy. Returns counts by
-        action. Raises TrainingDiverged: the run cannot go back. A CUDA device is read at the end of a window only.
-
-        Args:
-            loss: scalar, photometric loss of the step, detached.
-            broken: [1] int32, number of surfels that are not finite.
-        """
+    def after(self, step: int, loss: Tensor) -> dict[str, float]:
+        """Check for divergence at the end of a window and roll back if needed; call it after each step's optimisers and
+        strategy. `loss`: scalar, photometric loss of the step, detached. Returns counts by action. Raises
+        TrainingDiverged: the run cannot go back."""
         if not self.on:
             return {}
         if self.schedule.recovering(step):
             self._sum, self._count = torch.zeros_like(loss), 0
         else:
             self._sum, self._count = self._sum.to(loss) + loss, self._count + 1
-        self._broken = torch.maximum(self._broken.to(broken), broken)
         left = self.schedule.max_steps - 1 - step
-        ends = left % self.window == 0  # the last window ends with the run
-        if ends or broken.device.type == "cpu":
-            most = int(self._broken)
-            self._broken = torch.zeros_like(broken)
-            if most > BROKEN_SHARE * len(self.scene):
-                return self._go_back(step, describe_broken(self.scene) or f"{most} surfels are not finite")
-        if not ends:
+        if left % self.window:  # the last window ends with the run
             return {}
         mean, count = float(self._sum) / max(1, self._count), self._count
         self._sum, self._count = torch.zeros_like(loss), 0

@@ -241,7 +241,7 @@ class Training:
         self.poses.step(projections, pixels, self.processes)
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(*projections)
-        loss, broken = self._reduce_over_views(photometric, [projection.broken for projection in projections])
+        loss = self._mean_over_views(photometric)
         factor = self.schedule.resolution_factor(step)
         try:
             report = self.strategy.step(
@@ -250,7 +250,7 @@ class Training:
         except TrainingDiverged as error:  # the optimisers broke the field or all surfels after the last loss
             report = self.guard.failed(step, error)
         else:
-            report |= self.guard.after(step, loss, broken)
+            report |= self.guard.after(step, loss)
         if "most_by_memory" in report:
             self.announce(memory_reached("Surfels", self.strategy.most))
         if report:
@@ -260,14 +260,12 @@ class Training:
         self.clock.stop()
         return report
 
-    def _reduce_over_views(self, losses: list[Tensor], broken: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Compute the mean loss over the step's views, and the largest count of non-finite surfels in one of them."""
+    def _mean_over_views(self, losses: list[Tensor]) -> Tensor:
         if self.processes.views == 1:
-            return losses[0], broken[0]
-        loss, most = torch.stack(losses).sum(), torch.stack(broken).amax(0)
+            return losses[0]
+        loss = torch.stack(losses).sum()
         self.processes.sum(loss)
-        self.processes.maximum(most)
-        return loss / self.processes.views, most
+        return loss / self.processes.views
 
     @property
     def by_memory(self) -> dict[str, int]:

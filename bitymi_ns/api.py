@@ -246,7 +246,7 @@ def bake_scene(
     """Bake a trained scene to a bundle, as `ns-export bitymi-atlas` does, and read it back.
 
     Args:
-        scene: of `train_scene`, with any texture.
+        scene: of `train_scene`, with any texture; its device does the work.
         views: the training photographs, on which texels are fine-tuned, with their `correction` if any.
         folder: of the bundle, complete or absent.
         background: [3] color behind the scene; None: black.

@@ -21,7 +21,15 @@ from bitymi_ns.bundle.write import write_bundle
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import joined, listed_texels, paged_texels, tile_means
-from bitymi_ns.codec.quantise import Atlas, EncodedAtlas, Range, choose_range, encode, round_to_bytes
+from bitymi_ns.codec.quantise import (
+    Atlas,
+    EncodedAtlas,
+    Range,
+    choose_range,
+    dequantised,
+    encode,
+    round_to_bytes,
+)
 from bitymi_ns.codec.surfel_codes import Codes, SurfelCodes
 from bitymi_ns.codec.texel_codes import (
     RESIDUAL_STEP,
@@ -205,7 +213,8 @@ def _coded(
     if stored is None:
         return stage.become(Coded, scene=scene, atlas=None, shown=stage.texels, **own)
     atlas, pages = stored
-    shown = listed_texels(torch.from_numpy(atlas.values(pages.numpy())), stage.packing, means)
+    values = torch.from_numpy(dequantised(pages.numpy(), atlas.range, atlas.alpha_scale))
+    shown = listed_texels(values, stage.packing, means)
     drawn = {"atlas": pages if pages.dtype == torch.uint8 else pages.float(), "alpha_scale": atlas.alpha_scale}
     scene = replace(scene, offset=atlas.range.offset, scale=atlas.range.scale, **drawn)
     cost = AtlasCost(

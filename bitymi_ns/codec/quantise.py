@@ -64,10 +64,6 @@ class Atlas:
         """PSNR in dB of the decoded tiles' colours against the atlas, peak 1; None if they are equal."""
         return None if self.mse == 0 else float(-10.0 * np.log10(self.mse))
 
-    def values(self, pages: np.ndarray) -> npt.NDArray[np.float32]:
-        """Dequantise stored texels [..., 4] to [..., C]: residual colours and, if stored, alphas."""
-        return _values(pages, self.format, self.range, self.alpha_scale)
-
 
 @dataclass(frozen=True)
 class EncodedAtlas(Atlas):
@@ -86,7 +82,7 @@ class EncodedAtlas(Atlas):
 
     def decoded(self) -> npt.NDArray[np.float32]:
         """Decode to [layers, height, width, C]: residual colours and, if stored, alphas."""
-        return self.values(self.pages().numpy())
+        return dequantised(self.pages().numpy(), self.range, self.alpha_scale)
 
 
 def choose_range(
@@ -153,7 +149,7 @@ def encode(
         mask = owned[layer, top // 4 : (top + len(values)) // 4].repeat(4, axis=0).repeat(4, axis=1)
         rgba = _quantised(values, format, value_range)
         data = encoder(rgba) if encoder else rgba.tobytes()
-        decoded = decode([data], format, width, len(values), value_range.offset, value_range.scale)[0]
+        decoded = dequantised(decode_pages([data], format, width, len(values)), value_range)[0]
         whole = Range(-RESIDUAL_LIMIT, 2 * RESIDUAL_LIMIT, "none")
         return data, *_errors(values[mask, :3], decoded[mask], whole if format == "fp16" else value_range)
 
@@ -232,24 +228,10 @@ def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: i
     return pages
 
 
-def decode(
-    payload: Sequence[bytes],
-    format: Format,
-    width: int,
-    height: int,
-    offset: float,
-    scale: float,
-    alpha_scale: float = 0.0,
-) -> npt.NDArray[np.float32]:
-    """Decode an atlas to texels [layers, height, width, C] float32: colours offset + scale * stored value, and alphas
-    if `alpha_scale` is not 0."""
-    pages = decode_pages(payload, format, width, height)
-    return _values(pages, format, Range(offset, scale, "none"), alpha_scale)
-
-
-def _values(pages: np.ndarray, format: Format, value_range: Range, alpha_scale: float) -> npt.NDArray[np.float32]:
+def dequantised(pages: np.ndarray, value_range: Range, alpha_scale: float = 0.0) -> npt.NDArray[np.float32]:
+    """Dequantise texels [..., 4], uint8 or float16, to [..., C]: colours and, unless `alpha_scale` is 0, alphas."""
     stored = pages[..., : 4 if alpha_scale else 3]
-    if format == "fp16":
+    if stored.dtype == np.float16:
         return stored.astype(np.float32)
     values = value_range.from_unorm8(stored)
     if alpha_scale:

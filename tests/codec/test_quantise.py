@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from bitymi_ns.codec.packing import pack
-from bitymi_ns.codec.quantise import Range, choose_range, decode, decode_pages, encode
+from bitymi_ns.codec.quantise import Range, choose_range, decode_pages, encode
 
 
 def paint(packing, value):
@@ -66,7 +66,7 @@ def test_uint8_is_exact_to_half_a_code(atlas):
     packing, texels = atlas
     chosen = choose_range(listed(packing, texels), "minmax")
     encoded = encode(texels, packing, "uint8", chosen)
-    decoded = decode(encoded.payload, "uint8", encoded.width, encoded.height, chosen.offset, chosen.scale)
+    decoded = encoded.decoded()
     mask = texels.any(axis=-1)
     assert np.abs(decoded - texels)[mask].max() <= chosen.scale / 255 * 0.501
     assert encoded.clipped_fraction == 0
@@ -80,7 +80,7 @@ def test_fp16_stores_the_values_themselves(atlas):
     packing, texels = atlas
     encoded = encode(texels, packing, "fp16")
     assert (encoded.range.offset, encoded.range.scale) == (0.0, 1.0)
-    decoded = decode(encoded.payload, "fp16", encoded.width, encoded.height, 0.0, 1.0)
+    decoded = encoded.decoded()
     np.testing.assert_array_equal(decoded, texels.astype(np.float16).astype(np.float32))
     assert encoded.nbytes == 8 * texels[..., 0].size
 

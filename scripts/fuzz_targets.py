@@ -21,7 +21,7 @@ from bitymi_ns.capture import exif
 from bitymi_ns.capture.colmap_model import forget_model
 from bitymi_ns.capture.depth_normal_maps import read_depth, read_normal
 from bitymi_ns.capture.lens import lenses_of
-from bitymi_ns.capture.points import ply_fault, read_points
+from bitymi_ns.capture.points import read_cloud
 from bitymi_ns.capture.types import CaptureError, ColmapCamera, MapFiles
 from bitymi_ns.measure.report.page import compose, to_page
 from bitymi_ns.measure.report.read import collect
@@ -191,8 +191,7 @@ def ply(work: Path) -> Target:
 
     def run(data: bytes) -> None:
         path.write_bytes(data)
-        if ply_fault(path) is None:
-            read_points(path)
+        read_cloud(path, "look")
 
     return Target(run, seeds, (PlyError, CaptureError))
 

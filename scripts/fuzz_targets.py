@@ -154,7 +154,7 @@ def exif_data(work: Path) -> Target:
 
 def maps(work: Path) -> Target:
     """Read depth and normal maps. The first byte selects the format."""
-    (lens,), _ = lenses_of(ColmapCamera("PINHOLE", 8, 6, (8.0, 8.0, 4.0, 3.0)), (8, 6), "a")
+    (lens,) = lenses_of(ColmapCamera("PINHOLE", 8, 6, (8.0, 8.0, 4.0, 3.0)), (8, 6), "a")
     endings, seeds = (".npy", ".npz", ".png", ".tiff", ".exr"), []
     for k, values in enumerate((np.ones((6, 8), np.float32), np.ones((6, 8), np.uint16), np.ones((6, 8, 3), "f4"))):
         buffer, packed = io.BytesIO(), io.BytesIO()

@@ -88,6 +88,7 @@ class Forecast:
         self._of_step, self._at_full_size = of_step, at_full_size
         self._sizes, self._pixels, self._surfels = sizes, pixels, surfels
         self._measured, self._times = np.zeros(1), np.ones(1)  # logarithm of a size, and how much longer a unit takes
+        self._beside = 0.0  # units that a step costs beside its views
         self._begin, self._warm = (0.0, 0.0), first + WARM
         self._seconds = self._cpu = self._steps = self._done = 0.0  # of the last steps: times, their number and units
         self._plan()
@@ -105,7 +106,7 @@ class Forecast:
             longer = np.interp(np.log(side * sizes), self._measured, self._times)
             return longer * ((side * sizes) ** 2 * self._pixels + SURFEL * self._surfels)
 
-        return self._of_step * of_view(self._sizes) + self._at_full_size * of_view(1.0)
+        return self._of_step * of_view(self._sizes) + self._at_full_size * of_view(1.0) + self._beside
 
     def compare_sizes(self, step: int, seconds: Mapping[float, float]) -> None:
         """Let steps at other sizes take as long as they were measured to take.
@@ -118,10 +119,10 @@ class Forecast:
             seconds: CPU seconds of a view in a step, by factor of the sides of pictures; of the size of this step, too.
         """
         sizes = np.array(sorted(seconds))
-        beside = max(0.0, self._cpu / self._steps - seconds[self._sizes[step]])  # of a step: for views of any size
+        beside = max(0.0, self._cpu / self._steps - seconds[self._sizes[step]])
         units = sizes**2 * self._pixels + SURFEL * self._surfels[step]
-        times = np.array([seconds[size] + beside for size in sizes]) / units
-        self._measured, self._times = np.log(sizes), times / times[-1]
+        times = np.array([seconds[size] for size in sizes]) / units
+        self._measured, self._times, self._beside = np.log(sizes), times / times[-1], beside / times[-1]
         before = self._units[step]
         self._plan()
         self._done *= self._units[step] / before

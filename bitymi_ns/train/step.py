@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import Scene
 
-TIMED_VIEWS = 2  # views that tell what a step takes at another size
+TIMED_VIEWS = 3  # views that tell what a step takes at another size
 
 
 def view_losses(
@@ -202,20 +202,19 @@ class Training:
             self._set_rates()
 
     def seconds_at(self, factor: float) -> float:
-        """Measure the mean CPU seconds of a few training views at another size, drawn, compared and differentiated. The
-        gradients are dropped: the run goes on as if nothing had been drawn. CPU time, as other programs may interrupt.
-        """
+        """Measure the CPU seconds of a training view at another size, drawn, compared and differentiated: the least of
+        a few, as the first ones pay for memory that later steps find. The gradients are dropped: the run goes on as if
+        nothing had been drawn. CPU time, as other programs may interrupt."""
         learned = [parameter for parameter in self.scene.parameters() if parameter.requires_grad]
         seconds = []
-        for index in spread(len(self._full_size), TIMED_VIEWS + 1):
+        for index in spread(len(self._full_size), TIMED_VIEWS):
             full = self._full_size[index]
             view = at_size(full, full.camera.scaled(factor) if factor < 1.0 else full.camera, learned[0].device)
             begin = time.process_time()
             terms, _ = view_losses(self.scene, view, self.schedule, self.step, LossWatch(), self.background)
             torch.autograd.grad(torch.stack(list(terms.values())).sum(), learned, allow_unused=True)
             seconds.append(time.process_time() - begin)
-        seconds = seconds[1:] or seconds  # the first one also pays for memory that later ones of this size find
-        return sum(seconds) / len(seconds)
+        return min(seconds)
 
     def combine(self) -> dict[str, Tensor]:
         """Average the gradients over all views of the step; call it after the backward passes. Returns rate factors [N]

@@ -28,6 +28,9 @@ MOST_LARGER = 8  # largest ratio of a map's side to its photograph's, which may 
 MOST_NUMBERS = 1 << 28  # most numbers of a map: 80 million normals, or 260 million depths
 FARTHEST = 65504.0  # depth from which on numbers mean "no depth": the largest half float, below Blender's 1e10
 
+EXR_HEADER = 1 << 24  # bytes of a file in which its header ends
+EXR_ATTRIBUTES = ("channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio")
+
 Check = Callable[[tuple[int, ...]], None]  # receives a header's shape, and raises if it must not be read
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # a damaged map gets one message, without OpenCV's
@@ -155,6 +158,7 @@ def _read_exr(path: Path, check: Check) -> npt.NDArray[np.generic]:
     import OpenEXR  # OpenCV 5 reads no such files, and 4 reads a channel Z as zeros
 
     with open_regular(path) as file:
+        _check_exr_header(file)
         image = OpenEXR.InputFile(file)
         box, channels = image.header()["dataWindow"], image.header()["channels"]
         shape = (box.max.y - box.min.y + 1, box.max.x - box.min.x + 1)
@@ -166,6 +170,19 @@ def _read_exr(path: Path, check: Check) -> npt.NDArray[np.generic]:
         planes = zip(names, image.channels(list(names)), strict=True)
         values = np.stack([np.frombuffer(plane, kinds[name]).reshape(shape) for name, plane in planes], axis=-1)
     return values if len(names) == 3 else values[..., 0]
+
+
+def _check_exr_header(file: IO[bytes]) -> None:
+    """Raise ValueError if the header lacks an attribute that every EXR file has: OpenEXR crashes on such files."""
+    data, at, names = file.read(EXR_HEADER), 8, set()
+    file.seek(0)
+    while data[at : at + 1] not in (b"", b"\0"):
+        end = data.index(b"\0", at)
+        kind = data.index(b"\0", end + 1)
+        names.add(data[at:end].decode("latin1"))
+        at = kind + 5 + int.from_bytes(data[kind + 1 : kind + 5], "little")
+    if missing := [name for name in EXR_ATTRIBUTES if name not in names]:
+        raise ValueError(f"its header has no {missing[0]}")
 
 
 def read_array(path: Path, check: Check) -> npt.NDArray[np.generic]:

@@ -17,7 +17,7 @@ import torch
 
 from bitymi_ns.capture.depth_normal_maps import MAPS, MapFiles, maps_beside, read_depth
 from bitymi_ns.capture.lens import lenses_of
-from bitymi_ns.capture.types import ColmapCamera
+from bitymi_ns.capture.types import CaptureError, ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.sample.capture import RoomView, first_hits, generate
 from bitymi_ns.sample.room import Room
@@ -228,6 +228,17 @@ def test_headers_are_compared_with_the_photograph_before_numbers_are_read(tmp_pa
     with refused(f"{name} cannot be read|declares"):
         (tmp_path / name).write_bytes(png(1 << 20, 1 << 20))
         read_depth(MapFiles(tmp_path / "depth.npy", confidence=tmp_path / name), LENS)
+
+
+def test_an_exr_file_whose_header_lacks_something_is_one_message(tmp_path: Path) -> None:
+    """OpenEXR ends the process on these. Found by scripts/fuzz.py."""
+    file = tmp_path / "a.exr"
+    write_exr(file, Y=np.ones((64, 64), np.float32))
+    whole = file.read_bytes()
+    for name in (b"dataWindow", b"channels", b"displayWindow"):
+        file.write_bytes(whole.replace(name, name[:-1] + b"?", 1))
+        with pytest.raises(CaptureError, match=f"its header has no {name.decode()}"):
+            read_depth(MapFiles(depth=file), LENS)
 
 
 @pytest.mark.parametrize("ending", [".exr", ".tif"])

@@ -58,7 +58,7 @@ def test_a_resumed_run_goes_on_with_its_corrections(
 
     def tune(baked: Any, views: Any, *rest: Any) -> Any:
         given.extend(view.correction for view in views)
-        return baked
+        return baked.encoded()
 
     monkeypatch.setattr(pipeline, "tune_atlas", tune)
     ExportAtlas(

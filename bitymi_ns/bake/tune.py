@@ -19,7 +19,7 @@ from bitymi_ns.codec.pages import first_texels, listed_texels
 from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCoder, TexelCodes
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.ranges import Count, Positive, PositiveCount, Share
+from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
 from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.schedules import falling
 from bitymi_ns.train.views import MemoryBudget, View, training_order
@@ -133,6 +133,12 @@ class TuneOptions(TexelSteps):
         because half of it would need twice the steps."""
         return cls(steps=0, coded_steps=steps, coded_rate=2 * cls.rate, val_every=0, cache_bytes=cache_bytes)
 
+    def check(self) -> None:
+        """Check the values; raise ValueError for one out of range."""
+        check_ranges(self)
+        if self.val_every == 1:
+            raise ValueError("val_every must not be 1: no view would be left to learn from")
+
 
 def tune_atlas(
     baked: Reduced | Rounded,
@@ -165,6 +171,7 @@ def tune_atlas(
         `FEWEST_VIEWS` views (without validation, none).
     """
     options = options or TuneOptions()
+    options.check()
     if len(views) < (FEWEST_VIEWS if options.val_every else 1):
         return baked.encoded(progress).stating(finetune=FineTuning(steps=0, views=len(views)))
     started, cpu_started = time.perf_counter(), time.process_time()

@@ -17,6 +17,7 @@ from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
 from bitymi_ns.ops import TexelAlpha, fitting_lists, project
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.progress import Progress, no_progress
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
 
 if TYPE_CHECKING:
@@ -136,10 +137,12 @@ def extract_surface(
 
     Raises:
         NoSurface: there is nothing to fuse.
+        ValueError: an option is out of range.
     """
     import open3d
 
     options = options or SurfaceOptions()
+    check_ranges(options)
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):  # errors are raised here instead
         small = [camera.within(BOX_SIDE) for camera in cameras]
         depths = []

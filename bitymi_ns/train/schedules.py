@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cached_property
 
 from bitymi_ns.ops.view_kinds import PARAMETERS
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
@@ -35,7 +36,7 @@ class Schedule:
             pixels: mean number of opaque, unmasked pixels per photograph.
 
         Raises:
-            ValueError: an argument is out of range.
+            ValueError: an argument or option is out of range.
         """
         if max_steps < 1:
             raise ValueError(f"a run needs at least one step, not {max_steps}")
@@ -44,6 +45,7 @@ class Schedule:
         self.config = config
         self.max_steps = max_steps
         self.extent = float(extent)
+        check_ranges(config)
         self._texels, self.pixels = texels, pixels
         self.plan()
 

@@ -1,6 +1,7 @@
 """Fine-tuning of a wrong atlas towards photographs of a known one."""
 
 from dataclasses import replace
+from functools import partial
 from statistics import fmean
 from typing import Any, TypeVar
 
@@ -274,6 +275,13 @@ def test_too_few_views_leave_the_atlas_alone(scene, wrong: Reduced, views: list[
     assert same.texels is wrong.texels and same.statistics.finetune.model_dump() == {"steps": 0, "views": 3}
     with pytest.raises(ValueError, match="without texture"):
         tune_atlas(prune_and_resample(trained_texels(scene(20, field=None), BakeOptions()), ()), views, BACKGROUND)
+
+
+@pytest.mark.parametrize("bad", [{"steps": -1}, {"val_every": 1}, {"rate": 0.0}, {"prior": -1.0}, {"ssim_weight": 2}])
+def test_options_out_of_range_are_refused(wrong: Reduced, views: list[View], bad: dict[str, float]) -> None:
+    tune = partial(tune_atlas, wrong, views, BACKGROUND)
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        tune(replace(TuneOptions(), **bad))
 
 
 def error(baked: Coded, views: list[View]) -> float:

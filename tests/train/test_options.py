@@ -8,6 +8,7 @@ import pytest
 
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import TrainConfig
+from bitymi_ns.train.schedules import Schedule
 
 UNBOUNDED = {"loss.overdraw_start", "loss.overdraw_stop", "densify.start", "densify.stop", "seed"}
 
@@ -38,4 +39,4 @@ def test_a_number_out_of_its_range_is_named(name: str, value: float) -> None:
     config, (group, _, rest) = TrainConfig(), name.partition(".")
     changed = replace(getattr(config, group), **{rest: value}) if rest else value
     with pytest.raises(ValueError, match=f"^{name} must be .*, not {value}"):
-        check_ranges(replace(config, **{group: changed}))
+        Schedule(replace(config, **{group: changed}), 100)

@@ -114,9 +114,10 @@ def polish_scene(
         a new bake with `statistics.polish`; with fewer than 4 views, `baked` with 0 steps in it.
 
     Raises:
-        ValueError: there is no atlas, or the view colours are reduced.
+        ValueError: there is no atlas, the view colours are reduced, or an option is out of range.
     """
     options = options or PolishOptions()
+    options.check()
     if len(views) < FEWEST_VIEWS:
         return baked.stating(polish=FineTuning(steps=0, views=len(views)))
     started, cpu_started = time.perf_counter(), time.process_time()

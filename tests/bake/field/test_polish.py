@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import pytest
@@ -167,6 +168,13 @@ def test_masks_and_exposures(truth: Trained, wrong: Trained, views: list[View]) 
     assert known > unknown + 1.0
 
 
-def test_too_few_views_change_nothing(wrong: Trained, views: list[View]) -> None:
+@pytest.mark.parametrize(
+    "bad", [{"steps": 0}, {"val_every": 1}, {"rate": 0.0}, {"share": 0.0}, {"pixels_per_texel": 0.0}]
+)
+def test_options_out_of_range_are_refused_and_too_few_views_change_nothing(
+    wrong: Trained, views: list[View], bad: dict[str, float]
+) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        partial(polish_scene, wrong, views, BACKGROUND)(replace(PolishOptions(), **bad))
     same = polish_scene(wrong, views[:3], BACKGROUND)  # too few
     assert same.texels is wrong.texels and same.statistics.polish.model_dump() == {"steps": 0, "views": 3}

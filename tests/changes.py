@@ -92,4 +92,4 @@ SPOILT: dict[str, Change] = {
     "binary": content(b"\xff\xfe\x00\x80" * 9),
     "deep": content("[" * 100_000),
 }
-"""What may stand in a file's place."""
+"""Changes that put another thing in a file's place."""

@@ -58,7 +58,7 @@ class BakeableScene(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """What every stage has: surfels with tiles, on the CPU."""
+    """Surfels with tiles, on the CPU, as every stage has them."""
 
     scene: BakedScene  # the N surfels; only a `Coded` one has an atlas
     rows: Tensor  # [N] int64, their rows in the trained scene

@@ -77,8 +77,9 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
         _numbered("scale", 3): torch.cat([surfels["log_scales"], flat], dim=1),
         COLUMNS["quats"]: quats,
     }
-    for name in GEOMETRY_PARAMETERS.keys() - {"means", "opacity_logits", "log_scales", "quats"}:
-        groups[COLUMNS[name]] = surfels[name].reshape(len(quats), -1)
+    for name in GEOMETRY_PARAMETERS:  # in the table's order, behind those of 3D Gaussian splatting
+        if name not in ("means", "opacity_logits", "log_scales", "quats"):
+            groups[COLUMNS[name]] = surfels[name].reshape(len(quats), -1)
     for name in ("view_base",) if lean else VIEW_COLORS[kind].names:
         values = surfels[name].reshape(len(quats), int(np.prod(surfels[name].shape[1:])))
         groups[_numbered(name, values.shape[1])] = values

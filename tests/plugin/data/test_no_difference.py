@@ -1,4 +1,4 @@
-"""What makes no difference, and what is said of a capture: tables of formats and changes."""
+"""Read captures after changes that make no difference, or that a line names: tables of formats and changes."""
 
 import json
 import re

@@ -5,15 +5,13 @@
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
 import torch
 from harness import Arguments, image_size, table
-from scenes import around, textured, trained_like, with_texels
+from scenes import textured, trained_like, with_texels
 from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
-from bitymi_ns.bundle import read_bundle
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 
 Run = Callable[[], object]
@@ -26,14 +24,6 @@ def baked(n: int, width: int, height: int, device: torch.device, every: bool = F
         return lambda: scene.render_views([camera], None, ops.baked.IMAGES)
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
-    return renderer.run
-
-
-def bundled(folder: Path, width: int, height: int, device: torch.device) -> Run:
-    """Prepare a frame of a bundle."""
-    bundle = read_bundle(folder, decode=False)
-    renderer = BakedRenderer(bundle.scene.to(device), width, height, images=("packed",))
-    renderer.draw([around(bundle, width, height)[0]])
     return renderer.run
 
 
@@ -78,14 +68,11 @@ def main(parser: Arguments, words: Sequence[str]) -> None:
     parser.add_argument("--surfels", type=int, default=300)
     parser.add_argument("--size", type=image_size, default="96x64", metavar="WxH", help="image size (%(default)s)")
     parser.add_argument("--sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
-    parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="draw these as well")
     parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
     arguments = parser.parse_args(words)
     device = parser.device()
-    made = {name: partial(SECTIONS[name], arguments.surfels) for name in arguments.sections}
-    made |= {folder.name: partial(bundled, folder) for folder in arguments.bundles}
-    for name, make in made.items():
-        run = make(*arguments.size, device)
+    for name in arguments.sections:
+        run = SECTIONS[name](arguments.surfels, *arguments.size, device)
         if arguments.times:
             print_times(name, run, arguments.times)
         else:

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from harness import Arguments, number, publish, say, table
+from harness import Arguments, Rows, number, publish, say, table
 
 from bitymi_ns.measure.bench.process import BenchError, run_measured
 
@@ -78,57 +78,55 @@ def watched(folder: Path) -> Iterator[list[float]]:
         seen += [float(line) for line in file if line.strip().isdigit()]
 
 
-class Commands:
-    """Sequential commands in a folder, with their costs in `rows`."""
-
-    def __init__(self, folder: Path, environment: dict[str, str]) -> None:
-        self.rows: list[tuple[str, dict[str, float] | None, float | None]] = []
-        """Command, cost of `run_measured` (None: failed), peak GPU memory of all programs, MB (None: no GPU)."""
-        self._folder, self._environment = folder, environment
-
-    def run(self, *words: object) -> bool:
-        """Run a command and return True on success."""
-        typed, log = [str(word) for word in words], self._folder / f"{len(self.rows)}.log"
-        cost = None
-        with watched(self._folder) as used, contextlib.suppress(BenchError):
-            cost = run_measured(typed, log, cwd=self._folder, env=self._environment)
-        self.rows.append((shlex.join(typed), cost, max(used, default=None)))
-        say(f"{'ended' if cost else 'failed, see ' + str(log)}: {self.rows[-1][0][:150]}")
-        return cost is not None
+def run(command: Sequence[object], folder: Path, environment: dict[str, str], costs: Rows) -> bool:
+    """Run a command in a folder, add its row to `costs`, and return True on success."""
+    words = [str(word) for word in command]
+    log, cells = folder / f"{len(costs.cells)}.log", ["failed", ""]
+    with watched(folder) as used, contextlib.suppress(BenchError):
+        cost = run_measured(words, log, cwd=folder, env=environment)
+        cells = [number(cost["process_seconds"], 1), number(cost["peak_bytes"] / 1e6, 0)]
+    done = cells[0] != "failed"
+    say(f"{'ended' if done else f'failed, see {log}'}: {shlex.join(words)[:150]}")
+    costs.cells.append([f"`{shlex.join(words)}`", *cells, number(max(used, default=None), 0)])
+    return done
 
 
-def all_commands(capture: Path, folder: Path, steps: int, options: Sequence[str], commands: Commands) -> None:
-    """Run all commands; each uses the results of those before it in `folder`."""
+def commands(capture: Path, steps: int, options: Sequence[str]) -> list[list[object]]:
+    """List the commands; each uses the results of those before it in the working folder."""
     train = ["ns-train", "bitymi", "--data", capture, "--output-dir", "outputs", "--experiment-name", "capture"]
-    train += ["--max-num-iterations", steps, "--vis", "tensorboard"]
-    run, bundle = folder / "outputs/capture/bitymi/whole", folder / "bundle/config.yml"
-    half = max(1, steps // 2)
-    kept = ("--timestamp", "whole", "--steps-per-save", half, "--save-only-latest-checkpoint", "False")
-    if not commands.run(*train, *kept, *options):
-        return
-    checkpoint = ("--load-dir", run / "nerfstudio_models", "--load-step", half)
-    commands.run(*train, "--timestamp", "resumed", *checkpoint, *options)
-    config = run / "config.yml"
-    commands.run("ns-eval", "--load-config", config, "--output-path", "trained.json")
-    if commands.run("ns-export", "bitymi-atlas", "--load-config", config, "--output-dir", "bundle"):
-        commands.run("ns-eval", "--load-config", bundle, "--output-path", "baked.json")
-        names = ("--rendered-output-names", "rgb", "depth")
-        commands.run("ns-render", "dataset", "--load-config", bundle, "--output-path", "maps", *names)
+    train += ["--max-num-iterations", steps, "--vis", "tensorboard", "--timestamp"]
+    folder, half = Path("outputs/capture/bitymi/whole"), max(1, steps // 2)
+    config, bundle = folder / "config.yml", "bundle/config.yml"
+    kept = ("--steps-per-save", half, "--save-only-latest-checkpoint", "False")
+    checkpoint = ("--load-dir", folder / "nerfstudio_models", "--load-step", half)
+    return [
+        [*train, "whole", *kept, *options],
+        [*train, "resumed", *checkpoint, *options],
+        ["ns-eval", "--load-config", config, "--output-path", "trained.json"],
+        ["ns-export", "bitymi-atlas", "--load-config", config, "--output-dir", "bundle"],
+        ["ns-eval", "--load-config", bundle, "--output-path", "baked.json"],
+        [
+            "ns-render",
+            "dataset",
+            "--load-config",
+            bundle,
+            "--output-path",
+            "maps",
+            "--rendered-output-names",
+            "rgb",
+            "depth",
+        ],
+    ]
 
 
-def tables(folder: Path, commands: Commands) -> str:
-    """Tabulate costs and quality as Markdown."""
-    cells = []
-    for command, cost, card in commands.rows:
-        took = (number(cost["process_seconds"], 1), number(cost["peak_bytes"] / 1e6, 0)) if cost else ("failed", "")
-        cells.append([f"`{command}`", *took, number(card, 0)])
-    quality, digits = [], {"psnr": 2, "ssim": 3, "lpips": 3, "surfels": 0}
+def quality(folder: Path) -> str:
+    """Tabulate what the evaluations of a folder found as Markdown."""
+    rows, digits = [], {"psnr": 2, "ssim": 3, "lpips": 3, "surfels": 0}
     for name in ("trained", "baked"):
         with contextlib.suppress(OSError):
             found = json.loads((folder / f"{name}.json").read_text())["results"]
-            quality.append([name, *(number(found.get(key), n) for key, n in digits.items())])
-    text = table(("command", "s", "MB of host", "MB of card"), cells)
-    return f"{text}\n\n{table(('', 'PSNR', 'SSIM', 'LPIPS', 'surfels'), quality)}"
+            rows.append([name, *(number(found.get(key), n) for key, n in digits.items())])
+    return table(("", "PSNR", "SSIM", "LPIPS", "surfels"), rows)
 
 
 def main(parser: Arguments, words: Sequence[str]) -> int:
@@ -141,10 +139,10 @@ def main(parser: Arguments, words: Sequence[str]) -> int:
     arguments = parser.parse_args(words)
     folder, capture = arguments.folder.resolve(), arguments.data.resolve()
     shutil.rmtree(folder, ignore_errors=True)
-    commands = Commands(folder, stand_in(folder / "stand-ins"))
+    environment, costs = stand_in(folder / "stand-ins"), Rows(("command", "s", "MB of host", "MB of card"))
     try:
-        all_commands(capture, folder, arguments.steps, arguments.options, commands)
+        done = [run(c, folder, environment, costs) for c in commands(capture, arguments.steps, arguments.options)]
     finally:  # an interrupted run leaves its results
         title, notes = f"nerfstudio on {capture.name}, {arguments.steps} steps", [f"Stand-ins for {', '.join(NAMES)}."]
-        publish(title, tables(folder, commands), notes, arguments.output)
-    return int(any(cost is None for _, cost, _ in commands.rows))
+        publish(title, f"{costs}\n\n{quality(folder)}", notes, arguments.output)
+    return int(not all(done))

@@ -12,13 +12,14 @@ from statistics import fmean
 from typing import Any
 
 import torch
-from harness import Arguments, Options, Rows, device_milliseconds, image_quality, means, number, publish, say
+from harness import Arguments, Options, Rows, device_milliseconds, means, number, publish, say
 from scenes import SplitCapture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.constants import SH_C0
+from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
@@ -155,7 +156,7 @@ def row(
     for view in (view.to(device) for view in capture.held_out):
         image = make(view.camera)()
         rgb = image if image.is_floating_point() else image.view(torch.uint8)[..., :3] / 255
-        qualities.append(image_quality(rgb, view.target(None, device), view.mask))
+        qualities.append(image_metrics(rgb, view.target(None, device), view.mask))
     good, every = means(qualities), max(1, len(capture.held_out) // CAMERAS)
     cameras = [view.camera.to(device) for view in capture.held_out[::every][:CAMERAS]]
     options = Options(device, 5, RUNS)

@@ -1,4 +1,4 @@
-"""Parse command lines, write Markdown pages, time calls and measure images for the scripts of this folder."""
+"""Parse command lines, write Markdown pages and time calls for the scripts of this folder."""
 
 import argparse
 import math
@@ -9,12 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
-from bitymi_ns import ops
 from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.markdown import number, page, table
-from bitymi_ns.train.losses import fitted_psnr, psnr
 
 __all__ = ["number", "say", "table"]  # re-exported: tables as those of `bitymi bench`
 CLOCK = 2.0e9  # upper bound of GPU clocks, Hz, to convert seconds to cycles of `torch.cuda._sleep`
@@ -121,13 +118,6 @@ def device_milliseconds(run: Callable[[], object], options: Options) -> float:
         torch.cuda.synchronize()
         times.append(begin.elapsed_time(end) / calls)
     return statistics.median(times)
-
-
-def image_quality(rgb: Tensor, target: Tensor, mask: Tensor | None = None) -> dict[str, float]:
-    """Measure PSNR, PSNR after an affine fit of colours, and SSIM of an image [H, W, 3]."""
-    rgb = rgb.float().clamp(0.0, 1.0)
-    psnrs = {"psnr": psnr(rgb, target, mask), "fitted_psnr": fitted_psnr(rgb, target, mask)}
-    return psnrs | {"ssim": float(ops.ssim(rgb, target))}
 
 
 def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:

@@ -4,13 +4,16 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import bitymi_ns
 from bitymi_ns import ops
 from bitymi_ns.bundle import Bundle
+from bitymi_ns.capture.types import OPENCV_AXES
 from bitymi_ns.codec.packing import pack
+from bitymi_ns.sample.capture import look_at
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
@@ -134,17 +137,13 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
 
 def around(bundle: Bundle, width: int, height: int) -> list[Camera]:
     """Build three cameras around the centre of a bundle, at the scale of training (cameras in the unit ball)."""
-    middle = bundle.scene.surfels["means"].median(dim=0).values
+    middle = bundle.scene.surfels["means"].median(dim=0).values.double().numpy()
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     cameras = []
     for angle in (0.0, 2.1, 4.2):
-        eye = middle + 0.7 * torch.tensor([math.cos(angle), math.sin(angle), 0.3])
-        forward = torch.nn.functional.normalize(middle - eye, dim=0)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, torch.tensor([0.0, 0.0, 1.0])), dim=0)
-        viewmat = torch.eye(4)
-        viewmat[:3, :3] = torch.stack([right, torch.linalg.cross(forward, right), forward])
-        viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-        cameras.append(Camera(viewmat, K, width, height))
+        eye = middle + 0.7 * np.array([math.cos(angle), math.sin(angle), 0.3])
+        viewmat = np.linalg.inv(look_at(eye, middle) @ OPENCV_AXES)
+        cameras.append(Camera(torch.from_numpy(viewmat).float(), K, width, height))
     return cameras
 
 

@@ -32,14 +32,12 @@ def test_stand_ins_are_imported_and_their_use_is_an_error(load: Callable[[str], 
 
 def test_commands_are_tabled_with_what_they_left(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
     card = load("gpu_nerfstudio")
-    commands = card.Commands(tmp_path, card.stand_in(tmp_path / "stand-ins"))
-    assert commands.run(sys.executable, "-c", "x = bytearray(200_000_000)")
-    assert not commands.run(sys.executable, "-c", "raise SystemExit(3)")
-    (_, cost, _), (_, failed, _) = commands.rows
-    assert cost["peak_bytes"] > 200e6 and failed is None
+    environment, costs = card.stand_in(tmp_path / "stand-ins"), card.Rows(("command", "s", "host", "card"))
+    assert card.run([sys.executable, "-c", "x = bytearray(200_000_000)"], tmp_path, environment, costs)
+    assert not card.run([sys.executable, "-c", "raise SystemExit(3)"], tmp_path, environment, costs)
+    assert float(costs.cells[0][2]) > 200 and "| failed |  |" in str(costs)
     (tmp_path / "baked.json").write_text(json.dumps({"results": {"psnr": 28.149, "lpips": 0.08}}))
-    text = card.tables(tmp_path, commands)
-    assert "| baked | 28.15 |  | 0.080 |  |" in text and "| failed |  |" in text
+    assert "| baked | 28.15 |  | 0.080 |  |" in card.quality(tmp_path)
 
 
 def test_wheels_are_parted_by_size(load: Callable[[str], ModuleType], tmp_path: Path) -> None:

@@ -29,33 +29,37 @@ OUTSIDE_Y = 30.0
 LAMP = (-0.6, 0.9, -0.7, 0.1)  # x0, x1, y0, y1 of the light in the ceiling
 
 BOX_CENTRE, BOX_HALF = np.float32([[0.65], [-0.05], [0.38]]), np.float32([[0.32], [0.26], [0.38]])
+BOX_REACH = np.float32([[np.hypot(*BOX_HALF[:2, 0])]] * 2 + [BOX_HALF[2]])  # half sides of its bounds
 BOX_COS, BOX_SIN = np.cos(np.float32(0.5)), np.sin(np.float32(0.5))  # of its yaw
 PLINTH = (np.float32([[-0.85], [-0.20], [0.0]]), np.float32([[-0.25], [0.40], [0.44]]))
 POLES = [(1.55, 0.95, 0.022, 2.6), (1.25, -0.95, 0.012, 1.35), (-1.45, -0.85, 0.016, 1.7)]  # x, y, radius, height
-
-UPRIGHTS, RUNGS = 8, 7  # thin bars of the lattice behind the sphere
 
 # Surfaces. 0 to 5 are the room's sides: x low, x high, y low, y high, floor, ceiling.
 LANDSCAPE, SPHERE, BOX, PLINTH_ID, BARS, POLE, KNOB = range(6, 13)
 SIDE_AXES = ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))
 """World axes of the normal of a side, of its texture's u and of its v."""
 BALLS = {
-    SPHERE: (np.float32([[-0.55], [0.10], [0.80]]), np.float32(0.36), (0.16, 0.20, 0.30), 0.55),
-    KNOB: (np.float32([[1.25], [-0.95], [1.37]]), np.float32(0.07), (0.85, 0.15, 0.10), 0.0),
+    SPHERE: (np.float32([[-0.55], [0.10], [0.80]]), 0.36, (0.16, 0.20, 0.30), 0.55),
+    KNOB: (np.float32([[1.25], [-0.95], [1.37]]), 0.07, (0.85, 0.15, 0.10), 0.0),
 }
 """Centre, radius, colour and gloss."""
-DISTANT = np.float32(1e9)
 NEAR = np.float32(1e-4)
 
 
-def _bars() -> tuple[np.ndarray, np.ndarray]:
-    """Build the corners (low, high), each [3, m], of the bars: a free-standing lattice and the window's cross."""
+UPRIGHTS, RUNGS = 8, 7  # thin bars of the lattice behind the sphere
+
+
+def _bars() -> np.ndarray:
+    """Build the corners (low, high), [2, m, 3, 1], of the bars: a free-standing lattice and the window's cross."""
     bars = [(x, x + 0.014, 1.000, 1.014, 0.0, 1.35) for x in (-1.75 + 0.17 * k for k in range(UPRIGHTS))]
     bars += [(-1.80, -0.50, 1.014, 1.026, z, z + 0.012) for z in (0.12 + 0.19 * k for k in range(RUNGS))]
     (x0, x1, z0, z1), y = WINDOW, float(HIGH[1, 0])
     bars.append(((x0 + x1) / 2 - 0.02, (x0 + x1) / 2 + 0.02, y - 0.03, y, z0, z1))
     bars.append((x0, x1, y - 0.03, y, (z0 + z1) / 2 - 0.015, (z0 + z1) / 2 + 0.015))
-    return np.float32(bars)[:, ::2].T, np.float32(bars)[:, 1::2].T
+    return np.float32(bars).reshape(-1, 3, 2, 1).transpose(2, 0, 1, 3)
+
+
+BARS_LOW, BARS_HIGH = _bars()
 
 
 @dataclass
@@ -66,7 +70,7 @@ class RoomHits:
     surface: np.ndarray  # [n] int8, index of the surface
     part: np.ndarray  # [n] int8, index of the bar or pole
 
-    def candidates(self, o: Image, inverse: Image, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    def candidates(self, o: Image, inverse: Image, low: Image, high: Image) -> np.ndarray:
         """Find the rays, as indices, that enter an axis-aligned box before their hits."""
         near, far = _slab(o, inverse, low, high)
         return np.flatnonzero((near < far) & (far > NEAR) & (near < self.t))
@@ -76,11 +80,6 @@ class RoomHits:
         closer = meets & (t > NEAR) & (t < self.t[index])
         chosen = index[closer]
         self.t[chosen], self.surface[chosen], self.part[chosen] = t[closer], surface, part
-
-
-def _origins(o: Image, index: np.ndarray) -> Image:
-    """Select the origins of rays; one that all share stays."""
-    return o if o.shape[1] == 1 else o.take(index, 1)
 
 
 def _dot(a: Image, b: Image) -> Image:
@@ -93,8 +92,10 @@ def _slab(o: Image, inverse: Image, low: np.ndarray, high: np.ndarray) -> tuple[
     return np.minimum(t0, t1).max(0), np.maximum(t0, t1).min(0)
 
 
-def _entry(a: Image, b: Image, c: Image) -> tuple[Image, np.ndarray]:
-    """Compute the smaller root t of a t^2 + 2 b t + c, and whether it exists."""
+def _round(o: Image, d: Image, centre: Image, radius: float) -> tuple[Image, np.ndarray]:
+    """Compute the t at which rays enter a ball, or with two axes a pole, and whether they meet it."""
+    oc = o - centre
+    a, b, c = _dot(d, d), _dot(oc, d), _dot(oc, oc) - np.float32(radius * radius)
     root = b * b - a * c
     return (-b - np.sqrt(np.maximum(root, 0))) / a, root > 0
 
@@ -104,7 +105,6 @@ class Room:
 
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
-        self.bars_low, self.bars_high = _bars()
         self.landscape = textures.landscape(rng)
         size = (HIGH - LOW)[:, 0]
         self.sides = []
@@ -137,12 +137,10 @@ class Room:
             ly = LAMP[2] + (LAMP[3] - LAMP[2]) * ((k // 8) + rng.random(dtype=np.float32)) / (samples // 8)
             d = np.float32([[lx], [ly], [HIGH[2, 0] - np.float32(0.01)]]) - p
             r2 = _dot(d, d) + np.float32(1e-4)
-            cosine = np.maximum(_dot(d, normal), 0) / np.sqrt(r2)
-            lamp_cosine = np.maximum(d[2], 0) / np.sqrt(r2)
-            blocked = RoomHits(np.ones_like(r2), np.zeros(n * n, np.int8), np.zeros(n * n, np.int8))
+            cosine, lamp_cosine = (np.maximum(x, 0) / np.sqrt(r2) for x in (_dot(d, normal), d[2]))
+            blocked = RoomHits(np.ones_like(r2), *np.zeros((2, n * n), np.int8))
             self._objects(p, d, blocked)
-            seen = ~(blocked.t < np.float32(0.999))
-            light += cosine * (0.35 + 0.65 * lamp_cosine) / (1 + 0.12 * r2) * seen
+            light += cosine * (0.35 + 0.65 * lamp_cosine) / (1 + 0.12 * r2) * (blocked.t >= np.float32(0.999))
         total = 0.42 * ambient + 1.05 * light / samples
         warm = np.float32([1.03, 1.0, 0.95])
         return (total[:, None] * warm).reshape(n, n, 3).astype(np.float32)
@@ -152,49 +150,40 @@ class Room:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             inverse = np.float32(1) / d
             for surface, (centre, radius, *_) in BALLS.items():
-                index = hits.candidates(o, inverse, centre - radius, centre + radius)
-                oc, dd = _origins(o, index) - centre, d.take(index, 1)
-                root = _entry(_dot(dd, dd), _dot(oc, dd), _dot(oc, oc) - radius * radius)
-                hits.shorten(index, *root, surface)
-            reach = np.float32([[np.hypot(*BOX_HALF[:2, 0])]] * 2 + [BOX_HALF[2]])
-            index = hits.candidates(o, inverse, BOX_CENTRE - reach, BOX_CENTRE + reach)
-            oo, dd = _to_box(_origins(o, index) - BOX_CENTRE), _to_box(d.take(index, 1))
+                index = hits.candidates(o, inverse, centre - np.float32(radius), centre + np.float32(radius))
+                hits.shorten(index, *_round(o[:, index], d[:, index], centre, radius), surface)
+            index = hits.candidates(o, inverse, BOX_CENTRE - BOX_REACH, BOX_CENTRE + BOX_REACH)
+            oo, dd = _turned(o[:, index] - BOX_CENTRE), _turned(d[:, index])
             near, far = _slab(oo, np.float32(1) / dd, -BOX_HALF, BOX_HALF)
             hits.shorten(index, near, near < far, BOX)
-            self._hit_boxes(o, inverse, hits, PLINTH_ID, *PLINTH)
+            index = hits.candidates(o, inverse, *PLINTH)
+            hits.shorten(index, _slab(o[:, index], inverse[:, index], *PLINTH)[0], True, PLINTH_ID)
             for part, (x, y, radius, height) in enumerate(POLES):
-                corners = ([x - radius, y - radius, 0], [x + radius, y + radius, height])
-                index = hits.candidates(o, inverse, *(np.float32(corner)[:, None] for corner in corners))
-                oo, dd = _origins(o, index), d.take(index, 1)
-                oc = oo[:2] - np.float32([[x], [y]])
-                t, meets = _entry(_dot(dd[:2], dd[:2]), _dot(oc, dd[:2]), _dot(oc, oc) - np.float32(radius * radius))
+                centre, reach = np.float32([[x], [y], [height / 2]]), np.float32([[radius], [radius], [height / 2]])
+                index = hits.candidates(o, inverse, centre - reach, centre + reach)
+                oo, dd = o[:, index], d[:, index]
+                t, meets = _round(oo[:2], dd[:2], centre[:2], radius)
                 z = oo[2] + t * dd[2]
                 hits.shorten(index, t, meets & (z > 0) & (z < height), POLE, part)
-            for first, last in ((0, UPRIGHTS + RUNGS), (UPRIGHTS + RUNGS, self.bars_low.shape[1])):
-                corners = self.bars_low[:, first:last], self.bars_high[:, first:last]
-                self._hit_boxes(o, inverse, hits, BARS, *corners, first)
-
-    def _hit_boxes(
-        self, o: Image, inverse: Image, hits: RoomHits, surface: int, lows: Image, highs: Image, first: int = 0
-    ) -> None:
-        """Hit axis-aligned boxes, corners [3, m], which are parts `first`, `first` + 1, ... of a surface."""
-        index = hits.candidates(o, inverse, lows.min(1, keepdims=True), highs.max(1, keepdims=True))
-        o, inverse = _origins(o, index), inverse.take(index, 1)
-        for k in range(lows.shape[1]):
-            near, far = _slab(o, inverse, lows[:, k : k + 1], highs[:, k : k + 1])
-            hits.shorten(index, near, near < far, surface, first + k)
+            for parts in (range(UPRIGHTS + RUNGS), range(UPRIGHTS + RUNGS, len(BARS_LOW))):
+                index = hits.candidates(o, inverse, BARS_LOW[parts].min(0), BARS_HIGH[parts].max(0))
+                oo, ii = o[:, index], inverse[:, index]
+                for part in parts:
+                    near, far = _slab(oo, ii, BARS_LOW[part], BARS_HIGH[part])
+                    hits.shorten(index, near, near < far, BARS, part)
 
     def hit(self, o: Image, d: Image) -> RoomHits:
         """Compute the first hits of rays that start inside the room."""
+        o = np.broadcast_to(o, d.shape)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            exits = np.where(d == 0, DISTANT, (np.where(d > 0, HIGH, LOW) - o) / d)
+            exits = np.where(d == 0, np.float32(1e9), (np.where(d > 0, HIGH, LOW) - o) / d)
         axis, t = exits.argmin(0), exits.min(0)
         surface = (2 * axis + (np.choose(axis, d) > 0)).astype(np.int8)
-        hits = RoomHits(t, surface, np.zeros(t.shape, np.int8))
+        hits = RoomHits(t, surface, np.zeros_like(surface))
         x, z = o[0] + t * d[0], o[2] + t * d[2]
         through = (x > WINDOW[0]) & (x < WINDOW[1]) & (z > WINDOW[2]) & (z < WINDOW[3])
         outside = np.flatnonzero((surface == 3) & through)
-        t[outside], surface[outside] = (np.float32(OUTSIDE_Y) - _origins(o, outside)[1]) / d[1, outside], LANDSCAPE
+        t[outside], surface[outside] = (np.float32(OUTSIDE_Y) - o[1, outside]) / d[1, outside], LANDSCAPE
         self._objects(o, d, hits)
         return hits
 
@@ -220,22 +209,21 @@ class Room:
         gloss = 0.0
         if surface in BALLS:
             centre, radius, rgb, gloss = BALLS[surface]
-            normal, base = (p - centre) / radius, np.float32(rgb)
+            normal, base = (p - centre) / np.float32(radius), np.float32(rgb)
         elif surface == BOX:
-            normal, u, v = _face(_to_box(p - BOX_CENTRE), -BOX_HALF, BOX_HALF)
-            normal = _from_box(normal)
+            normal, u, v = _face(_turned(p - BOX_CENTRE), -BOX_HALF, BOX_HALF)
+            normal = _turned(normal, -BOX_SIN)
             base, gloss = textures.lookup(self.box_texture, u, v), 0.10
         elif surface == PLINTH_ID:
             normal, u, v = _face(p, *PLINTH)
             base = textures.lookup(self.plinth_texture, u, v)
         elif surface == BARS:
-            normal, _, _ = _face(p, self.bars_low[:, part], self.bars_high[:, part])
-            brass, black, white = np.float32([0.75, 0.60, 0.20]), np.float32([0.12] * 3), np.float32([0.92, 0.92, 0.90])
-            base = np.where((part < UPRIGHTS)[:, None], brass, black)
-            base = np.where((part >= UPRIGHTS + RUNGS)[:, None], white, base)
+            normal, _, _ = _face(p, BARS_LOW[part, :, 0].T, BARS_HIGH[part, :, 0].T)
+            brass, black, white = [0.75, 0.60, 0.20], [0.12] * 3, [0.92, 0.92, 0.90]
+            base = np.float32([brass] * UPRIGHTS + [black] * RUNGS + [white] * 2)[part]
         else:
             x, y, radius, _ = (np.float32(column)[part] for column in zip(*POLES, strict=True))
-            normal = np.stack([(p[0] - x) / radius, (p[1] - y) / radius, np.zeros_like(radius)])
+            normal = np.stack([(p[0] - x) / radius, (p[1] - y) / radius, 0 * radius])
             stripe = ((p[2] * np.float32(8)).astype(np.int32) % 2 == 0) & (part == 0)
             base = np.where(stripe[:, None], np.float32([0.85, 0.20, 0.15]), np.float32([0.85, 0.85, 0.82]))
         light = np.float32([[(LAMP[0] + LAMP[1]) / 2], [(LAMP[2] + LAMP[3]) / 2], HIGH[2]]) - p
@@ -255,13 +243,9 @@ class Room:
         return np.clip(result, 0, 1).astype(np.float32)
 
 
-def _to_box(v: Image) -> Image:
-    """Rotate from world axes to the box's."""
-    return np.stack([BOX_COS * v[0] + BOX_SIN * v[1], BOX_COS * v[1] - BOX_SIN * v[0], v[2]])
-
-
-def _from_box(v: Image) -> Image:
-    return np.stack([BOX_COS * v[0] - BOX_SIN * v[1], BOX_SIN * v[0] + BOX_COS * v[1], v[2]])
+def _turned(v: Image, sine: np.float32 = BOX_SIN) -> Image:
+    """Rotate from world axes to the box's; with the negative sine back."""
+    return np.stack([BOX_COS * v[0] + sine * v[1], BOX_COS * v[1] - sine * v[0], v[2]])
 
 
 def _face(p: Image, low: np.ndarray, high: np.ndarray) -> tuple[Image, Image, Image]:

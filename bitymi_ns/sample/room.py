@@ -111,7 +111,9 @@ class Room:
         for side, (paint, color, posters) in enumerate(WALLS):
             wall = paint(rng, size[SIDE_AXES[side][1]], size[2], *color)
             for width, height, kind, left, bottom in posters:
-                textures.hang(wall, textures.poster(rng, width, height, kind), left, bottom)
+                picture = textures.poster(rng, width, height, kind)
+                y, x = (round(metres * textures.TEXELS_PER_METRE) for metres in (bottom, left))
+                wall[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
             self.sides.append(wall)
         self.sides.append(textures.wood_tiles(rng, size[0], size[1]))
         self.sides.append(textures.plaster(rng, size[0], size[1], (0.92, 0.92, 0.90)))

@@ -10,40 +10,36 @@ Image = NDArray[np.float32]
 TEXELS_PER_METRE = 160.0
 
 
+def _texels(x: Image, n: int) -> tuple[NDArray[np.int32], Image]:
+    """Find the lower of the two texels to interpolate at each x in [0, n] (clamped), and the share of the other."""
+    x = np.clip(x - np.float32(0.5), 0, n - 1)
+    low = np.minimum(x.astype(np.int32), n - 2)
+    return low, (x - low).astype(np.float32)
+
+
 def lookup(texture: Image, u: Image, v: Image) -> Image:
     """Sample colors [n, 3] bilinearly at u, v [n] in [0, 1] (clamped), u along the columns."""
     h, w = texture.shape[:2]
-    x = np.clip(u * np.float32(w) - np.float32(0.5), 0, w - 1)
-    y = np.clip(v * np.float32(h) - np.float32(0.5), 0, h - 1)
-    x0 = np.minimum(x.astype(np.int32), w - 2)
-    y0 = np.minimum(y.astype(np.int32), h - 2)
-    fx = (x - x0)[:, None].astype(np.float32)
-    fy = (y - y0)[:, None].astype(np.float32)
-    flat = texture.reshape(-1, 3)
-    i = y0 * w + x0
-    top = flat[i] * (1 - fx) + flat[i + 1] * fx
-    bottom = flat[i + w] * (1 - fx) + flat[i + w + 1] * fx
+    (x, fx), (y, fy) = _texels(u * np.float32(w), w), _texels(v * np.float32(h), h)
+    flat, i, fx, fy = texture.reshape(-1, 3), y * w + x, fx[:, None], fy[:, None]
+    top, bottom = (flat[j] * (1 - fx) + flat[j + 1] * fx for j in (i, i + w))
     return top * (1 - fy) + bottom * fy
 
 
 def resize(image: Image, height: int, width: int) -> Image:
     """Resample an image [h, w] or [h, w, c] bilinearly to [height, width] or [height, width, c], edges clamped."""
-    for axis, size in ((0, height), (1, width)):
-        n = image.shape[axis]
-        x = np.clip((np.arange(size, dtype=np.float32) + 0.5) * np.float32(n / size) - np.float32(0.5), 0, n - 1)
-        low = np.minimum(x.astype(np.int32), max(n - 2, 0))
-        f = (x - low).reshape((-1,) + (1,) * (image.ndim - 1 - axis)).astype(np.float32)
-        image = np.take(image, low, axis) * (1 - f) + np.take(image, np.minimum(low + 1, n - 1), axis) * f
+    for size in (height, width):
+        n = len(image)
+        low, f = _texels((np.arange(size, dtype=np.float32) + 0.5) * np.float32(n / size), n)
+        f = f.reshape(-1, *[1] * (image.ndim - 1))
+        image = (image[low] * (1 - f) + image[low + 1] * f).swapaxes(0, 1)
     return image
 
 
 def grid(width_m: float, height_m: float) -> tuple[Image, Image]:
     """Compute metric coordinates (x, y), each [h, w], of the texel centres of a surface."""
-    w = max(2, round(width_m * TEXELS_PER_METRE))
-    h = max(2, round(height_m * TEXELS_PER_METRE))
-    x = (np.arange(w, dtype=np.float32) + 0.5) * np.float32(width_m / w)
-    y = (np.arange(h, dtype=np.float32) + 0.5) * np.float32(height_m / h)
-    return tuple(np.meshgrid(x, y))
+    sides = [(side, max(2, round(side * TEXELS_PER_METRE))) for side in (width_m, height_m)]
+    return tuple(np.meshgrid(*((np.arange(n, dtype=np.float32) + 0.5) * np.float32(side / n) for side, n in sides)))
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int = 4) -> Image:
@@ -74,8 +70,8 @@ def wood_tiles(rng: np.random.Generator, width_m: float, height_m: float, tile: 
     dark = mix((0.33, 0.19, 0.10), (0.50, 0.31, 0.17), rings)
     light = mix((0.66, 0.48, 0.29), (0.85, 0.69, 0.46), rings)
     color = np.where(odd[..., None], dark, light) * (0.82 + 0.18 * shift + 0.2 * (fine - 0.5))[..., None]
-    gap = np.minimum(np.minimum(x % tile, tile - x % tile), np.minimum(y % tile, tile - y % tile)) < 0.008
-    return np.where(gap[..., None], np.float32(0.12), color).astype(np.float32)
+    color[np.minimum(np.minimum(x % tile, tile - x % tile), np.minimum(y % tile, tile - y % tile)) < 0.008] = 0.12
+    return color.astype(np.float32)
 
 
 def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
@@ -103,9 +99,8 @@ def wallpaper(rng: np.random.Generator, width_m: float, height_m: float) -> Imag
     stripe = (x / 0.16).astype(int) % 2 == 0
     diamond = np.abs((x % 0.16) - 0.08) + np.abs((y % 0.12) - 0.06) < 0.035
     color = np.where(stripe[..., None], np.float32([0.30, 0.48, 0.50]), np.float32([0.78, 0.76, 0.64]))
-    color = np.where((diamond & stripe)[..., None], np.float32([0.92, 0.80, 0.42]), color)
-    color = np.where((diamond & ~stripe)[..., None], np.float32([0.55, 0.25, 0.28]), color)
-    return (color * (0.9 + 0.2 * noise(rng, x.shape, (30, 60), 3))[..., None]).clip(0, 1).astype(np.float32)
+    color[diamond] = np.where(stripe[diamond, None], (0.92, 0.80, 0.42), (0.55, 0.25, 0.28))
+    return (color * (0.9 + 0.2 * noise(rng, x.shape, (30, 60), 3))[..., None]).clip(0, 1)
 
 
 def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, margin: float = 0.05) -> None:
@@ -114,6 +109,8 @@ def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, mar
     letters = rng.random((26, 7, 3)) < 0.55
     letters = np.concatenate([letters, letters[:, :, 1::-1]], axis=2)  # mirrored: they look drawn, not random
     letters[:, :, 0] |= rng.random((26, 1)) < 0.5
+    # v points up on walls, so a letter's first row comes last
+    letters = letters[:, ::-1].repeat(texel, 1).repeat(texel, 2)
     h, w = image.shape[:2]
     edge = round(margin * TEXELS_PER_METRE)
     for top in range(edge, h - edge - 7 * texel, 10 * texel):
@@ -121,19 +118,15 @@ def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, mar
         if rng.random() < 0.25:
             end = round(end * rng.uniform(0.4, 0.9))
         for left in range(edge, end, 6 * texel):
-            letter = rng.integers(0, 32)
-            if letter >= 26:
-                continue  # a space between words
-            # v points up on walls, so a letter's first row comes last
-            mask = np.kron(letters[letter][::-1], np.ones((texel, texel), bool))
-            image[top : top + mask.shape[0], left : left + mask.shape[1]][mask] = (0.08, 0.07, 0.10)
+            if (letter := rng.integers(0, 32)) < 26:  # the others are spaces between words
+                image[top : top + 7 * texel, left : left + 5 * texel][letters[letter]] = (0.08, 0.07, 0.10)
 
 
 def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str) -> Image:
     """Paint a framed poster: `text`, `rings` (zone plate), `noise` (marble) or `bars` (color bars)."""
     x, y = grid(width_m, height_m)
     if kind == "text":
-        image = np.broadcast_to(np.float32([0.93, 0.91, 0.84]), (*x.shape, 3)).copy()
+        image = np.full((*x.shape, 3), (0.93, 0.91, 0.84), np.float32)
         print_text(rng, image)
     elif kind == "rings":
         r2 = (x - width_m / 2) ** 2 + (y - height_m / 2) ** 2
@@ -144,17 +137,10 @@ def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str)
         vein = np.abs(np.sin(18 * n + 3 * x))
         image = mix(mix((0.05, 0.30, 0.28), (0.85, 0.30, 0.20), n), (0.98, 0.93, 0.80), vein**6)
     else:
-        colors = rng.random((24, 3), dtype=np.float32)
-        image = colors[(x / width_m * 24).astype(int).clip(0, 23)]
+        image = rng.random((24, 3), dtype=np.float32)[(x / width_m * 24).astype(int).clip(0, 23)]
         image = np.where(((y / height_m * 10).astype(int) % 2 == 0)[..., None], image, 1 - image)
-    frame = np.minimum(np.minimum(x, width_m - x), np.minimum(y, height_m - y)) < 0.025
-    return np.where(frame[..., None], np.float32([0.10, 0.08, 0.07]), image).astype(np.float32)
-
-
-def hang(wall: Image, picture: Image, left_m: float, bottom_m: float) -> None:
-    """Draw `picture` onto `wall` in place, its lower left corner at the given metres from the wall's."""
-    top, left = round(bottom_m * TEXELS_PER_METRE), round(left_m * TEXELS_PER_METRE)
-    wall[top : top + picture.shape[0], left : left + picture.shape[1]] = picture
+    image[np.minimum(np.minimum(x, width_m - x), np.minimum(y, height_m - y)) < 0.025] = (0.10, 0.08, 0.07)
+    return image.astype(np.float32)
 
 
 def landscape(rng: np.random.Generator) -> Image:
@@ -171,12 +157,10 @@ def landscape(rng: np.random.Generator) -> Image:
         image = np.where((v < ridge)[..., None], np.asarray(color, np.float32) * shade[..., None], image)
     for _ in range(60):
         x, y, r = rng.uniform(0, w), rng.uniform(60, 150), rng.uniform(8, 20)
-        rows, columns = slice(int(y - r), int(y + r)), slice(max(0, int(x - r)), int(x + r))
-        yy, xx = np.mgrid[rows, columns]
+        place = (slice(int(y - r), int(y + r)), slice(max(0, int(x - r)), min(w, int(x + r))))
+        yy, xx = np.ogrid[place]
         crown = (xx - x) ** 2 + (yy - y) ** 2 < (r * rng.uniform(0.7, 1.0)) ** 2
-        part = image[rows, columns]
-        crown = crown[: part.shape[0], : part.shape[1]]
-        part[crown] = np.float32([0.10, 0.28, 0.10]) * rng.uniform(0.7, 1.5)
+        image[place][crown] = np.float32([0.10, 0.28, 0.10]) * rng.uniform(0.7, 1.5)
     for _ in range(14):
         x, y, s = int(rng.uniform(0, w - 80)), int(rng.uniform(60, 120)), int(rng.uniform(24, 44))
         image[y : y + s, x : x + int(1.4 * s)] = rng.uniform(0.6, 0.95, 3)

@@ -4,7 +4,7 @@ ns-export, ns-eval."""
 import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Literal, TextIO
@@ -41,10 +41,10 @@ class Sample:
 
     def run(self) -> None:
         from bitymi_ns import sample
+        from bitymi_ns.progress import rich_progress
 
-        options = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "output_dir"}
-        with write_errors_as(self.output_dir, ValueError):
-            folder = sample.generate(self.output_dir, **options, progress=True)
+        with write_errors_as(self.output_dir, ValueError), rich_progress() as progress:
+            folder = sample.generate(**vars(self), progress=progress)
         say(f"Wrote {self.views} images and {self.points} points to {folder}")
 
 

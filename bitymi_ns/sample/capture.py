@@ -1,9 +1,6 @@
 """Render the sample room along a camera path and write it as a nerfstudio capture."""
 
 import json
-import os
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -13,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PILImage
 
+from bitymi_ns.capture.image_files import in_threads
 from bitymi_ns.files import complete_folder
 from bitymi_ns.ply import write_cloud
-from bitymi_ns.progress import no_progress, rich_progress
+from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.sample.room import Room, RoomHits
 from bitymi_ns.trust import check_replaceable
@@ -41,11 +39,9 @@ class RoomView:
         h, w = self.height * supersample, self.width * supersample
         x = ((np.arange(w) + 0.5) / supersample - self.width / 2) / self.focal
         y = (self.height / 2 - (np.arange(h) + 0.5) / supersample) / self.focal
-        d = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1)
-        d = d @ self.camera_to_world[:3, :3].T
+        d = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1) @ self.camera_to_world[:3, :3].T
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
-        rays = np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)
-        return self.camera_to_world[:3, 3:].astype(np.float32), rays
+        return self.camera_to_world[:3, 3:].astype(np.float32), np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)
 
 
 def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -117,7 +113,7 @@ def generate(
     seed: int = 0,
     points: int = 8000,
     overwrite: bool = False,
-    progress: bool = False,
+    progress: Progress = no_progress,
 ) -> Path:
     """Write the sample capture to `output_dir` and return that folder.
 
@@ -139,9 +135,34 @@ def generate(
     def check() -> None:
         check_replaceable(output_dir, "a sample capture", _files_of(output_dir), overwrite, FileExistsError)
 
+    path, done = camera_path(views, width, height, seed), count(1)
     with complete_folder(output_dir, check) as new:
-        _write(new, views, width, height, seed, points, progress)
+        (new / "images").mkdir()
+        room = Room(seed)
+
+        def frame(k: int) -> NDArray[np.uint8]:
+            image = render(room, path[k])
+            PILImage.fromarray(image).save(new / _image(k))
+            progress("Rendering the sample room", next(done), views)
+            return image
+
+        write_cloud(new / CLOUD, *sparse_points(room, path, in_threads(frame, range(views)), points, seed))
+        meta = {
+            **{"made_by": MADE_BY, "camera_model": "OPENCV", "w": width, "h": height},
+            **{"fl_x": FOCAL * width, "fl_y": FOCAL * width, "cx": width / 2, "cy": height / 2},
+            **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
+            "ply_file_path": CLOUD,
+            "frames": [
+                {"file_path": _image(k), "transform_matrix": view.camera_to_world.tolist()}
+                for k, view in enumerate(path)
+            ],
+        }
+        (new / CAPTURE).write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
     return output_dir
+
+
+def _image(k: int) -> str:
+    return f"images/frame_{k + 1:05d}.png"
 
 
 def _files_of(folder: Path) -> list[str] | None:
@@ -152,37 +173,3 @@ def _files_of(folder: Path) -> list[str] | None:
         return None
     images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
     return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)] if made_by == MADE_BY else None
-
-
-def _write(folder: Path, views: int, width: int, height: int, seed: int, points: int, progress: bool) -> None:
-    (folder / "images").mkdir()
-    path = camera_path(views, width, height, seed)
-    names = [f"images/frame_{k + 1:05d}.png" for k in range(views)]
-
-    with rich_progress() if progress else nullcontext(no_progress) as report_progress:
-        room, done = Room(seed), count(1)
-
-        def frame(k: int) -> NDArray[np.uint8]:
-            image = render(room, path[k])
-            PILImage.fromarray(image).save(folder / names[k])
-            report_progress("Rendering the sample room", next(done), views)
-            return image
-
-        with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:  # numpy releases the GIL
-            try:
-                images = list(pool.map(frame, range(views)))
-            except BaseException:  # also Ctrl-C: do not wait for pending frames
-                pool.shutdown(cancel_futures=True)
-                raise
-    write_cloud(folder / CLOUD, *sparse_points(room, path, images, points, seed))
-    meta = {
-        **{"made_by": MADE_BY, "camera_model": "OPENCV", "w": width, "h": height},
-        **{"fl_x": FOCAL * width, "fl_y": FOCAL * width, "cx": width / 2, "cy": height / 2},
-        **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-        "ply_file_path": CLOUD,
-        "frames": [
-            {"file_path": name, "transform_matrix": view.camera_to_world.tolist()}
-            for name, view in zip(names, path, strict=True)
-        ],
-    }
-    (folder / CAPTURE).write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")

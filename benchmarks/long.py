@@ -36,7 +36,7 @@ from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, wit
 from bitymi_ns.measure.machine import commit
 from bitymi_ns.measure.report.read import add_cells
 from bitymi_ns.measure.report.records import Records, over_seeds
-from bitymi_ns.measure.report.tables import markdown_tables, quality_tables
+from bitymi_ns.measure.report.tables import quality_markdown
 from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
@@ -223,8 +223,7 @@ def main() -> None:
     cells.refresh()
     records, own = Records(), {identity(run.key(), "cell") for run in runs}
     add_cells((cell for cell in cells if identity(cell["key"], "cell", "bundle") in own), cells.path, records)
-    tables = markdown_tables(quality_tables(over_seeds(records.evaluations), training=True))
-    publish("Long and short runs", "\n\n".join(tables), (), options.output)
+    publish("Long and short runs", quality_markdown(over_seeds(records.evaluations)), (), options.output)
 
 
 def read_arguments() -> Namespace:

@@ -27,7 +27,7 @@ from bitymi_ns.measure.bench.matrix import (
 from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.report.read import add_cells
 from bitymi_ns.measure.report.records import Records
-from bitymi_ns.measure.report.tables import NOTES, markdown_tables, quality_tables
+from bitymi_ns.measure.report.tables import NOTES, quality_markdown
 from bitymi_ns.trust import printable
 
 FAILED, INTERRUPTED = 1, 130  # exit statuses after a failed cell and after Ctrl-C
@@ -114,6 +114,5 @@ def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[st
     records = Records()
     add_cells(found, cells.path, records)
     failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
-    body = "\n\n".join(markdown_tables(quality_tables(records.evaluations, training=True)))
-    training = "Training s, CPU s: of the steps alone; peak: of ns-train as a whole."
-    return markdown.page(title, body, [NOTES, training, *failed], [cell["made"]["commit"] for cell in found])
+    body = quality_markdown(records.evaluations)
+    return markdown.page(title, body, [NOTES, *failed], [cell["made"]["commit"] for cell in found])

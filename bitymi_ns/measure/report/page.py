@@ -9,10 +9,10 @@ from bitymi_ns import __version__
 from bitymi_ns.files import check_writable, write_errors_as, write_file
 from bitymi_ns.measure.markdown import rendered
 from bitymi_ns.measure.report.pictures import ERROR_CAPTION, compare_views
-from bitymi_ns.measure.report.plots import Plot, draw_plots
+from bitymi_ns.measure.report.plots import draw_plots
 from bitymi_ns.measure.report.read import collect
-from bitymi_ns.measure.report.records import Records, ReportError, over_seeds
-from bitymi_ns.measure.report.tables import NOTES, quality_tables, training_table
+from bitymi_ns.measure.report.records import Records, ReportError, grouped, over_seeds
+from bitymi_ns.measure.report.tables import NOTES, quality_tables
 from bitymi_ns.safe_reading import open_regular
 
 PAGE = "index.html"
@@ -20,7 +20,6 @@ GENERATOR = '<meta name="generator" content="bitymi report">'  # marks pages tha
 TEXTS = {
     "views": f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}.",
     "tables": NOTES,
-    "trade_off": "The dashed line is the Pareto front: of all points of a scene those that no other beats in both.",
 }
 
 
@@ -30,17 +29,13 @@ def compose(records: Records, title: str) -> dict[str, Any]:
     scenes = {row.scene for row in records.evaluations}
     counts = {"evaluation": records.evaluations, "training run": records.curves, "scene": scenes}
     counted = ", ".join(f"{len(c)} {noun}{'' if len(c) == 1 else 's'}" for noun, c in counts.items() if c)
-    measured = f" Measured on: {'; '.join(records.machines)}." if records.machines else ""
-    sections: dict[str, list[Plot]] = {}
-    for plot in draw_plots(records.evaluations, records.curves):
-        sections.setdefault(plot.section, []).append(plot)
+    measured = f" Measured on: {'; '.join(dict.fromkeys(records.machines))}." if records.machines else ""
     return {
         "title": title,
         "intro": f"{counted}. Made by bitymi report {__version__}.{measured}",
         "views": compare_views(records.images, notes),
         "quality": quality_tables(over_seeds(records.evaluations)),
-        "training": training_table(records.curves),
-        "sections": sections,
+        "sections": grouped(draw_plots(records.evaluations, records.curves), lambda plot: plot.section),
         "notes": notes,
     }
 
@@ -48,16 +43,6 @@ def compose(records: Records, title: str) -> dict[str, Any]:
 def to_page(content: dict[str, Any]) -> str:
     """Render the report as a self-contained HTML document."""
     return rendered("report.html.j2", content=content, generator=GENERATOR, texts=TEXTS)
-
-
-def _check_output(page: Path) -> None:
-    """Refuse to replace a page other than a report."""
-    if page.exists():
-        with open_regular(page) as file:
-            if GENERATOR not in file.read(4096).decode("utf8", "replace"):
-                raise ReportError(
-                    f"{page} was not made by bitymi report and will not be replaced; give another folder."
-                )
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
@@ -75,7 +60,12 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
     page = output_dir / PAGE
     with write_errors_as(output_dir, ReportError):
         check_writable(page)
-        _check_output(page)
+        if page.exists():
+            with open_regular(page) as file:
+                if GENERATOR not in file.read(4096).decode("utf8", "replace"):
+                    raise ReportError(
+                        f"{page} was not made by bitymi report and will not be replaced; give another folder."
+                    )
     text = to_page(compose(collect(list(inputs), output_dir), title))
     with write_errors_as(output_dir, ReportError):
         write_file(page, text.encode("utf8"))

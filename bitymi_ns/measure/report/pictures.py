@@ -7,14 +7,15 @@ import math
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import matplotlib
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
+from bitymi_ns.measure.report.records import grouped
 from bitymi_ns.safe_reading import open_regular
 
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
@@ -23,36 +24,33 @@ ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the c
 ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
 MAX_SETS = 4  # sets of photographs per page
 MAX_WIDTH = 1200  # of embedded images, pixels
-MAX_PNG_BYTES = 400_000  # larger images are embedded as JPEG of quality 92
-_RANKS = (("Worst view", 0.0), ("Median view", 0.5), ("Best view", 1.0))
+RANKS = {"Worst view": 0.0, "Median view": 0.5, "Best view": 1.0}
 
 Pixels = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class Picture:
-    """An encoded image with its caption and size in pixels."""
+class Picture(NamedTuple):
+    """A JPEG image with its caption and size in pixels."""
 
     caption: str
-    mime: str
     data: bytes
     width: int
     height: int
 
 
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Columns of images under one heading."""
 
     title: str
-    columns: tuple[tuple[Picture, ...], ...]
+    columns: list[list[Picture]]
 
 
-@dataclass(frozen=True)
-class _Render:
+class View(NamedTuple):
+    """A photograph beside its render: file, PSNR in dB, and digest of the photograph."""
+
     path: Path
     psnr: float
-    digest: bytes  # of the photograph
+    digest: bytes
 
 
 def open_image(path: Path) -> Image.Image:
@@ -71,45 +69,9 @@ def _encode(pixels: Pixels, caption: str) -> Picture:
     """Scale an image [H, W, 3] in [0, 1] down if it is wide, and encode it."""
     image = Image.fromarray((pixels * 255.0).round().astype(np.uint8))
     image.thumbnail((MAX_WIDTH, image.height), Image.LANCZOS)
-    buffer, mime = io.BytesIO(), "image/png"
-    image.save(buffer, "PNG")
-    if buffer.tell() > MAX_PNG_BYTES:
-        buffer, mime = io.BytesIO(), "image/jpeg"
-        image.save(buffer, "JPEG", quality=92, subsampling=0)
-    return Picture(caption, mime, buffer.getvalue(), image.width, image.height)
-
-
-def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
-    """Choose and encode views among images of photographs beside renders; appends a note for unreadable images.
-
-    The columns of a view are the photograph and, for each folder, the render above its error map; with one folder the
-    error map is beside the render. Views are ranked by PSNR without masks, averaged over the folders.
-    """
-    folders: dict[Path, dict[int, _Render]] = {}
-    for path in sorted(p.resolve() for p in images):
-        try:
-            match = SIDE_BY_SIDE.match(path.stem)
-            if match is None:
-                raise OSError("its name is not eval_img_ with a number, as ns-eval names a photograph beside a render")
-            photograph, render = _halves(path)
-        except OSError as error:
-            notes.append(f"{path} is not an image that can be shown: {error}.")
-            continue
-        squared = float(np.mean((photograph - render) ** 2, dtype=np.float64))
-        digest = hashlib.sha256(photograph.tobytes()).digest()
-        of_folder = folders.setdefault(path.parent, {})
-        of_folder[int(match["index"])] = _Render(path, -10.0 * math.log10(max(1e-10, squared)), digest)
-    sets: dict[tuple, list[Path]] = {}
-    for folder, renders in folders.items():
-        sets.setdefault(tuple((index, r.digest) for index, r in renders.items()), []).append(folder)
-    if len(sets) > MAX_SETS:
-        notes.append(f"Views of {len(sets) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
-    shared = os.path.commonpath(folders) if len(folders) > 1 else ""
-    groups = []
-    for members in list(sets.values())[:MAX_SETS]:
-        names = {os.path.relpath(f, shared) if shared not in ("", str(f)) else f.name: folders[f] for f in members}
-        groups += _compared(dict(sorted(names.items())), len(sets) > 1)
-    return groups
+    buffer = io.BytesIO()
+    image.save(buffer, "JPEG", quality=92, subsampling=0)
+    return Picture(caption, buffer.getvalue(), image.width, image.height)
 
 
 def _halves(path: Path) -> tuple[Pixels, Pixels]:
@@ -121,21 +83,52 @@ def _halves(path: Path) -> tuple[Pixels, Pixels]:
     return pixels[:, :width], pixels[:, width:]
 
 
-def _compared(folders: dict[str, dict[int, _Render]], named: bool) -> list[Group]:
+def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
+    """Choose and encode views among images of photographs beside renders; appends a note for unreadable images.
+
+    The columns of a view are the photograph and, for each folder, the render above its error map; with one folder the
+    error map is beside the render. Views are ranked by PSNR without masks, averaged over the folders.
+    """
+    folders: dict[Path, dict[int, View]] = {}
+    for path in sorted(p.resolve() for p in images):
+        try:
+            match = SIDE_BY_SIDE.match(path.stem)
+            if match is None:
+                raise OSError("its name is not eval_img_ with a number, as ns-eval names a photograph beside a render")
+            photograph, render = _halves(path)
+        except OSError as error:
+            notes.append(f"{path} is not an image that can be shown: {error}.")
+            continue
+        squared = float(np.mean((photograph - render) ** 2, dtype=np.float64))
+        digest = hashlib.sha256(photograph.tobytes()).digest()
+        view = View(path, -10.0 * math.log10(max(1e-10, squared)), digest)
+        folders.setdefault(path.parent, {})[int(match["index"])] = view
+    sets = list(grouped(folders, lambda f: tuple((i, view.digest) for i, view in folders[f].items())).values())
+    if len(sets) > MAX_SETS:
+        notes.append(f"Views of {len(sets) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
+    shared = os.path.commonpath(folders) if len(folders) > 1 else ""
+    groups = []
+    for members in sets[:MAX_SETS]:
+        names = {os.path.relpath(f, shared) if shared not in ("", str(f)) else f.name: folders[f] for f in members}
+        groups += _compared(dict(sorted(names.items())), len(sets) > 1)
+    return groups
+
+
+def _compared(folders: dict[str, dict[int, View]], named: bool) -> list[Group]:
     """Encode the views of folders that show the same photographs; `named`: the folders are in the titles."""
     first = next(iter(folders.values()))
-    ranked = sorted(first, key=lambda index: sum(renders[index].psnr for renders in folders.values()))
+    ranked = sorted(first, key=lambda index: sum(views[index].psnr for views in folders.values()))
     chosen: dict[int, str] = {}
-    for rank, quantile in _RANKS:
+    for rank, quantile in RANKS.items():
         chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], rank)
-    views, title = [], f"{', '.join(folders)}: " if named else ""
+    groups, title = [], f"{', '.join(folders)}: " if named else ""
     for index, rank in chosen.items():
-        columns = [(_encode(_halves(first[index].path)[0], "photograph"),)]
-        for name, renders in folders.items():
-            photograph, render = _halves(renders[index].path)
+        columns = [[_encode(_halves(first[index].path)[0], "photograph")]]
+        for name, views in folders.items():
+            photograph, render = _halves(views[index].path)
             error = np.clip(np.abs(photograph - render).mean(-1) / ERROR_SCALE, 0.0, 1.0)
             heat = matplotlib.colormaps["inferno"](error)[..., :3].astype(np.float32)
-            drawn = _encode(render, f"{name}: {renders[index].psnr:.2f} dB"), _encode(heat, f"error of {name}")
-            columns += [drawn] if len(folders) > 1 else [(picture,) for picture in drawn]
-        views.append(Group(f"{title}{rank} of {len(ranked)}: number {index}", tuple(columns)))
-    return views
+            drawn = [_encode(render, f"{name}: {views[index].psnr:.2f} dB"), _encode(heat, f"error of {name}")]
+            columns += [drawn] if len(folders) > 1 else [[picture] for picture in drawn]
+        groups.append(Group(f"{title}{rank} of {len(ranked)}: number {index}", columns))
+    return groups

@@ -2,8 +2,8 @@
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -33,40 +33,33 @@ METRICS = {
 MIN_POINTS = 3  # minimum number of points of a plot; for fewer the tables suffice
 
 
-@dataclass(frozen=True)
-class Plot:
-    """A plot: title, section of the page, number of panels, PNG bytes; `front`: has a Pareto front."""
+class Plot(NamedTuple):
+    """A plot: title, section of the page, number of panels, PNG bytes."""
 
     title: str
     section: str
     panels: int
     png: bytes
-    front: bool
 
 
-@dataclass(frozen=True)
-class Cost:
-    """A cost axis: name in titles, axis label, section of the page, value."""
+class Cost(NamedTuple):
+    """A cost axis: label, section of the page, key of the results and factor to the axis's unit."""
 
-    title: str
     label: str
     section: str
-    value: Callable[[Evaluation], float | None]
+    key: str
+    factor: float = 1.0
+
+    def value(self, row: Evaluation) -> float | None:
+        """Return the cost of an evaluation; None if it is unknown or 0."""
+        return (row.results.get(self.key) or 0.0) * self.factor or None
 
 
-def costs(rows: list[Evaluation]) -> tuple[Cost, ...]:
-    """List the cost axes. Sizes are those of whole bundles (downloads) if all bundles state them, else of atlases."""
-
-    def positive(key: str, scale: float = 1.0) -> Callable[[Evaluation], float | None]:
-        return lambda e: (e.results.get(key) or 0.0) * scale or None
-
-    baked = [e for e in rows if e.baked]
-    what = "bundle" if baked and all(e.results.get("bundle_bytes") for e in baked) else "atlas"
-    return (
-        Cost("training seconds", "training seconds", TRAINING, positive("train_seconds")),
-        Cost("render milliseconds", "milliseconds per view", RENDERING, positive("render_ms")),
-        Cost(f"{what} size", f"{what} MB", SIZE, positive(f"{what}_bytes", 1e-6)),
-    )
+COSTS = (
+    Cost("training seconds", TRAINING, "train_seconds"),
+    Cost("milliseconds per view", RENDERING, "render_ms"),
+    Cost("bundle MB", SIZE, "bundle_bytes", 1e-6),
+)
 
 
 def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, float]]:
@@ -83,37 +76,36 @@ def draw_plots(evaluations: list[Evaluation], curves: list[Curve]) -> list[Plot]
     """Draw all plots that have a panel with at least MIN_POINTS points."""
     names = dict.fromkeys([*sorted({e.method for e in evaluations}), *sorted({c.label for c in curves})])
     colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(names)}
-    plots = [_curve_plot(*axes, curves, colors) for axes in CURVES]
-    plots += [pareto_plot(key, cost, evaluations, colors) for cost in costs(evaluations) for key in METRICS]
+    plots = [curve_plot(*axes, curves, colors) for axes in CURVES]
+    plots += [pareto_plot(key, cost, evaluations, colors) for cost in COSTS for key in METRICS]
     return [plot for plot in plots if plot is not None]
 
 
-def _curve_plot(
+def _panels(scenes: set[str], draw: Callable[[str, Axes], None], x: str, y: str) -> list[Panel]:
+    return [Panel(partial(draw, scene), scene or "no scene named", x, y) for scene in sorted(scenes)]
+
+
+def curve_plot(
     title: str, x: str, y: str, keys: tuple[str, str], curves: list[Curve], colors: dict[str, str]
 ) -> Plot | None:
-    drawn = [c for c in curves if c.series(*keys)[0]]
-    if max((len(c.series(*keys)[0]) for c in drawn), default=0) < MIN_POINTS:
+    """Draw a column of training curves over another one; None if no curve has enough points."""
+    lines = [(curve, *curve.series(*keys)) for curve in curves]
+    lines = [line for line in lines if line[1]]
+    if max((len(xs) for _, xs, _ in lines), default=0) < MIN_POINTS:
         return None
 
     def panel(scene: str, axes: Axes) -> None:
-        for curve in drawn:
+        for curve, xs, ys in lines:
             if curve.scene == scene:
-                xs, ys = curve.series(*keys)
                 marker = "o" if len(xs) <= 20 else ""
                 axes.plot(xs, ys, color=colors[curve.label], linewidth=1.6, marker=marker, ms=3)
         if keys[1] == "surfels":
             axes.set_ylim(bottom=0)
 
-    legend = [Line2D([], [], color=colors[label], label=label) for label in sorted({c.label for c in drawn})]
-    return _of_scenes(title, TRAINING, sorted({c.scene for c in drawn}), panel, x, y, legend)
-
-
-def _of_scenes(
-    title: str, section: str, scenes: list[str], panel: Callable[[str, Axes], None], x: str, y: str,
-    legend: list[Line2D], front: bool = False,
-) -> Plot:  # fmt: skip
-    panels = [Panel(partial(panel, scene), scene or "no scene named", x, y) for scene in scenes]
-    return Plot(title, section, len(scenes), png(panels, legend), front)
+    labels = sorted({curve.label for curve, *_ in lines})
+    panels = _panels({curve.scene for curve, *_ in lines}, panel, x, y)
+    picture = png(panels, [Line2D([], [], color=colors[label], label=label) for label in labels])
+    return Plot(title, TRAINING, len(panels), picture)
 
 
 def pareto_panel(
@@ -153,16 +145,16 @@ def pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: dic
         legend.append(Line2D([], [], label="trained", **HOLLOW, **mark))
     names = {variant: f"baked, {variant}" if variant else "baked" for variant in variants}
     legend += [Line2D([], [], marker=markers[v], ms=6, label=name, **mark) for v, name in names.items()]
-    legend.append(Line2D([], [], color=INK, label="Pareto front", **DASHES))
+    legend.append(Line2D([], [], color=INK, label="Pareto front: no point is better in both", **DASHES))
 
     def panel(scene: str, axes: Axes) -> None:
         pareto_panel(axes, [e for e in drawn if e.scene == scene], key, cost, colors, markers)
 
-    title = f"{METRICS[key][0].removesuffix(' (dB)')} against {cost.title}"
-    scenes = sorted({e.scene for e in drawn})
-    return _of_scenes(title, cost.section, scenes, panel, cost.label, METRICS[key][0], legend, front=True)
+    title = f"{METRICS[key][0].removesuffix(' (dB)')} against {cost.label}"
+    panels = _panels({e.scene for e in drawn}, panel, cost.label, METRICS[key][0])
+    return Plot(title, cost.section, len(panels), png(panels, legend))
 
 
 def _variant(row: Evaluation) -> str:
-    """Strip the method from a label, which leaves the atlas format or another distinguishing suffix."""
+    """Strip the method from a label, which leaves the bundle's name or another distinguishing suffix."""
     return (row.group or row.label).removeprefix(row.method).strip(", ()")

@@ -95,7 +95,7 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
             name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
         suffix = f", seed {seed}" if seeds[series[run]] > 1 and seed is not None else ""
         scene = str(key.get("scene") or "unnamed scene")
-        trained = Evaluation(scene, name, False, name + suffix, {}, "", path, run, name, series[run], seed)
+        trained = Evaluation(scene, name, False, name + suffix, {}, path, run, name, series[run], seed)
         _add_run(trained, suffix, runs[run], records)
 
 
@@ -123,13 +123,13 @@ def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict
     curve = folder / str(train["curve"]) if train.get("curve") else None
     if curve is not None and os.path.isfile(curve):
         _, curves, notes = read_jsonl(curve)
-        records.curves += [replace(c, scene=trained.scene, label=trained.label, run=trained.run) for c in curves]
+        records.curves += [replace(c, scene=trained.scene, label=trained.label) for c in curves]
         records.notes += notes
 
 
 def _walk(folder: Path, skip: Path) -> Iterator[Path]:
-    """List the files below `folder`, sorted, without hidden folders, links to folders, and `skip`; of a benchmark's
-    work folder only its cells, which name all other files."""
+    """List the files below `folder` that may be inputs, sorted, without hidden folders, links to folders, and `skip`;
+    of a benchmark's work folder only its cells, which name all other files."""
     for root, folders, files in os.walk(folder):
         here = Path(root)
         if CELLS in files:
@@ -142,27 +142,29 @@ def _walk(folder: Path, skip: Path) -> Iterator[Path]:
             for name in folders
             if depth < MAX_DEPTH and not name.startswith(".") and name not in _SKIPPED and here / name != skip
         )
-        yield from (here / name for name in sorted(files))
+        for file in map(here.joinpath, sorted(files)):
+            kind = file.suffix.lower()
+            if kind in (".json", ".jsonl") or (kind == ".png" and SIDE_BY_SIDE.match(file.stem)):
+                yield file
 
 
 def _read(path: Path, records: Records) -> bool:
     """Add the records of a file; return False if it has none."""
-    before = len(records.images) + len(records.evaluations) + len(records.curves)
+    found = Records()
     if path.suffix.lower() == ".png":
-        records.images.append(path)
+        found.images.append(path)
     elif path.name == CELLS:
         try:
-            add_cells(Cells(path), path, records)
+            add_cells(Cells(path), path, found)
         except BenchError as error:
             raise ReportError(str(error)) from error
     elif path.suffix.lower() == ".jsonl":
-        evaluations, curves, notes = read_jsonl(path)
-        records.evaluations += evaluations
-        records.curves += curves
-        records.notes += notes
+        found.evaluations, found.curves, found.notes = read_jsonl(path)
     elif is_evaluation(data := parse_json(read_text(path), str(path))):
-        records.evaluations.append(evaluation_from(data, path))
-    return len(records.images) + len(records.evaluations) + len(records.curves) > before
+        found.evaluations.append(evaluation_from(data, path))
+    for name, values in vars(found).items():
+        vars(records)[name] += values
+    return bool(found.images or found.evaluations or found.curves)
 
 
 def collect(inputs: list[Path], output_dir: Path) -> Records:
@@ -182,24 +184,22 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
     for path in sorted(paths, key=lambda p: p.is_dir()):
         if not path.exists():
             raise ReportError(f"{path} does not exist. Give ns-eval JSON files, training curves (.jsonl) or folders.")
-        if not path.is_dir():
-            if path.resolve() not in seen and not _read(path, records):
+        for file in _walk(path.resolve(), output_dir.resolve()) if path.is_dir() else [path]:
+            if file.resolve() in seen:
+                continue
+            seen.add(file.resolve())
+            try:
+                usable = _read(file, records)
+            except ReportError as error:
+                if file is path:
+                    raise
+                records.notes.append(str(error))
+                continue
+            if file is path and not usable:
                 raise ReportError(
                     f"{path} holds neither an evaluation (a JSON object with 'results', as ns-eval writes it) "
                     "nor a training curve (JSON lines with 'step') nor lines of bitymi bench."
                 )
-            seen.add(path.resolve())
-            continue
-        for file in _walk(path.resolve(), output_dir.resolve()):
-            wanted = file.suffix.lower() in (".json", ".jsonl")
-            wanted = wanted or (file.suffix.lower() == ".png" and SIDE_BY_SIDE.match(file.stem))
-            if not wanted or file.resolve() in seen:
-                continue
-            seen.add(file.resolve())
-            try:
-                _read(file, records)
-            except ReportError as error:
-                records.notes.append(str(error))
     if not (records.evaluations or records.curves):
         where = ", ".join(map(str, paths)) or "no inputs"
         more = "".join(f"\n  {note}" for note in records.notes)

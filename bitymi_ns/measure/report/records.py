@@ -1,16 +1,15 @@
 """Records of a report and the links between them: evaluations, training curves."""
 
-import re
 import statistics
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.trust import finite_numbers
 
-_BUNDLE_SUFFIX = re.compile(r"[-_]?(bundle|baked)$")
-_FORMAT = re.compile(r"(?<![a-z0-9])(fp16|uint8|bc7|compact)(?![a-z0-9])")
+T = TypeVar("T")
+K = TypeVar("K", bound=Hashable)
 
 
 class ReportError(ValueError):
@@ -22,11 +21,10 @@ class Evaluation:
     """Evaluation of a model on the held-out views."""
 
     scene: str  # experiment name; evaluations are compared within one scene
-    method: str  # method name without a suffix for baking, so that a bundle shares it with its trained scene
+    method: str  # method name, which a bundle shares with its trained scene
     baked: bool  # True for a bundle
     label: str  # for tables, unique within its scene and stage after `disambiguate`
-    results: dict[str, float]  # finite numbers by name (psnr, ssim, render_ms, atlas_bytes, ...)
-    checkpoint: str  # recorded path of the checkpoint, may be empty
+    results: dict[str, float]  # finite numbers by name (psnr, ssim, render_ms, bundle_bytes, ...)
     source: Path  # file it was read from
     run: str = ""  # identity of the training run, empty if unknown (a bare ns-eval file)
     group: str = ""  # label without the seed; empty: not grouped over seeds
@@ -42,7 +40,6 @@ class Curve:
     label: str
     points: list[dict[str, float]]
     source: Path
-    run: str = ""
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
         """Return the columns x and y of the points that have both."""
@@ -68,45 +65,23 @@ class Records:
 def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
     """Build an evaluation from ns-eval's JSON object."""
     results = finite_numbers(data["results"])
-    checkpoint = str(data.get("checkpoint") or "")
-    name = str(data.get("method_name") or "unnamed method")
-    parts = Path(checkpoint.replace("\\", "/")).parts
-    tail = "/".join(parts[-2 if parts[-1:] == (MANIFEST,) else -4 :]).lower()
-    baked = "bundle_bytes" in results or results.get("atlas_bytes", 0.0) > 0  # which earlier versions stated alone
-    method = (_BUNDLE_SUFFIX.sub("", name) or name) if baked else name
-    form = _FORMAT.search(tail) or _FORMAT.search(f"{source.parent.name}/{source.stem}".lower())
-    label = f"{method}, {form[1]}" if baked and form else method
+    method = str(data.get("method_name") or "unnamed method")
     scene = str(data.get("experiment_name") or source.parent.name or "unnamed scene")
-    return Evaluation(scene, method, baked, label, results, checkpoint, source)
+    return Evaluation(scene, method, "bundle_bytes" in results, method, results, source)
 
 
 def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
-    """Build a curve from the objects of a JSONL file.
-
-    If a step occurs twice (a resumed run), its last line is used. Scene and label come from the lines
-    (`experiment_name`, `method_name`), nerfstudio's folders <experiment>/<method>/<time>, or the file's name.
-    """
-    points: dict[float, dict[str, float]] = {}
-    for line in lines:
-        numbers = finite_numbers(line)
-        points[numbers["step"]] = numbers
+    """Build a curve from the objects of a JSONL file, whose `experiment_name` and `method_name` name it, else its file.
+    If a step occurs twice (a resumed run), its last line is used."""
+    points = {numbers["step"]: numbers for numbers in map(finite_numbers, lines)}
     named = {key: value for line in lines for key, value in line.items() if isinstance(value, str) and value}
-    scene, label = named.get("experiment_name", ""), named.get("method_name", "")
-    if not (scene and label) and (source.parent / "config.yml").is_file() and len(source.resolve().parts) > 4:
-        experiment, method = source.resolve().parts[-4:-2]
-        scene, label = scene or experiment, label or method
-    return Curve(scene, label or source.stem, [points[step] for step in sorted(points)], source)
+    scene, label = named.get("experiment_name", ""), named.get("method_name", source.stem)
+    return Curve(scene, label, [points[step] for step in sorted(points)], source)
 
 
 def link(records: Records) -> None:
-    """Link records: name curves after the evaluation whose checkpoint is in their folder, make labels unique, and add
-    missing training times to evaluations from the only curve of their scene and method."""
-    for i, curve in enumerate(records.curves):
-        folder = str(curve.source.resolve().parent)
-        parents = (e for e in records.evaluations if not curve.run and not e.baked and e.checkpoint)
-        owner = next((e for e in parents if folder in map(str, Path(e.checkpoint).parents)), None)
-        if owner:
-            records.curves[i] = replace(curve, scene=owner.scene, label=owner.method)
+    """Link records: make labels unique, and add missing training times to evaluations from the only curve of their
+    scene and method."""
     disambiguate(records.evaluations)
     disambiguate(records.curves)
     for i, row in enumerate(records.evaluations):
@@ -118,43 +93,48 @@ def link(records: Records) -> None:
         records.evaluations[i] = replace(row, results={**row.results, **known})
 
 
+def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
+    """Group items by their keys, in the order of the first of each."""
+    groups: dict[K, list[T]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
+def mean_results(rows: Sequence[Evaluation]) -> dict[str, float]:
+    """Average the results that all of the evaluations have."""
+    keys = set.intersection(*(set(row.results) for row in rows))
+    return {key: statistics.fmean(row.results[key] for row in rows) for key in sorted(keys)}
+
+
 def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
     """Average runs that differ only in their seed; `psnr_seeds` is the standard deviation of their PSNR.
 
     `psnr_delta` of bundles, their PSNR minus that of the trained scene, is computed per run before averaging.
     """
-    deltas = [psnr_delta(row, evaluations) for row in evaluations]
-    evaluations = [
-        row if delta is None else replace(row, results={**row.results, "psnr_delta": delta})
-        for row, delta in zip(evaluations, deltas, strict=True)
-    ]
-    groups: dict[tuple, list[Evaluation]] = {}
-    for i, row in enumerate(evaluations):
-        key = (row.scene, row.baked, row.group, row.series) if row.group else (i,)
-        groups.setdefault(key, []).append(row)
     merged = []
-    for rows in groups.values():
-        if len(rows) == 1:
-            merged.append(rows[0])
+    for rows in grouped(with_deltas(evaluations), lambda row: (row.scene, row.baked, row.group, row.series)).values():
+        if len(rows) == 1 or not rows[0].group:
+            merged += rows
             continue
-        keys = set.intersection(*(set(row.results) for row in rows))
-        means = {key: sum(row.results[key] for row in rows) / len(rows) for key in sorted(keys)}
+        means = mean_results(rows)
         if "psnr" in means:
             means["psnr_seeds"] = statistics.stdev(row.results["psnr"] for row in rows)
-        first = rows[0]
-        label = f"{first.group} ({len(rows)} seeds)"
-        merged.append(replace(first, label=label, results=means, run=first.series, seed=None))
+        label = f"{rows[0].group} ({len(rows)} seeds)"
+        merged.append(replace(rows[0], label=label, results=means, run=rows[0].series, seed=None))
     return merged
 
 
-def psnr_delta(row: Evaluation, evaluations: list[Evaluation]) -> float | None:
-    """Compute the PSNR of a bundle minus that of its trained scene; None if unknown."""
-    known = row.results.get("psnr_delta")
-    if known is not None:
-        return known
-    parent = trained_parent(row, evaluations)
-    before, after = (parent.results.get("psnr") if parent else None), row.results.get("psnr")
-    return None if before is None or after is None else after - before
+def with_deltas(evaluations: list[Evaluation]) -> list[Evaluation]:
+    """Add `psnr_delta` to the results of bundles whose trained scene is known."""
+    rows = []
+    for row in evaluations:
+        parent = trained_parent(row, evaluations)
+        if parent is not None and "psnr" in row.results and "psnr" in parent.results:
+            delta = {"psnr_delta": row.results["psnr"] - parent.results["psnr"]}
+            row = replace(row, results=delta | row.results)
+        rows.append(row)
+    return rows
 
 
 def trained_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
@@ -178,10 +158,8 @@ def _suffixes(sources: list[Path]) -> list[str]:
 
 def disambiguate(items: list) -> None:
     """Make the labels of evaluations (within a scene and stage) or curves (within a scene) unique, in place."""
-    groups: dict[tuple, list[int]] = {}
-    for i, item in enumerate(items):
-        groups.setdefault((item.scene, getattr(item, "baked", None), item.label), []).append(i)
-    for indices in groups.values():
+    same = grouped(range(len(items)), lambda i: (items[i].scene, getattr(items[i], "baked", None), items[i].label))
+    for indices in same.values():
         if len(indices) > 1:
             for i, suffix in zip(indices, _suffixes([items[i].source for i in indices]), strict=True):
                 items[i] = replace(items[i], label=f"{items[i].label} ({suffix})")

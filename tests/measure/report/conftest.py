@@ -23,12 +23,11 @@ RUNS = {
 FORMATS = {"fp16": (0.001, 6, 0.24), "uint8": (-0.004, 4, 0.22), "bc7": (-0.031, 1, 0.23)}
 
 
-def evaluation(scene: str, method: str, checkpoint: str, **results: float) -> dict:
+def evaluation(scene: str, method: str, **results: float) -> dict:
     """Write ns-eval's JSON object, with its standard deviations and rates."""
     results = {"lpips": math.nan, "num_rays_per_sec": 81_234.5, "fps": 0.63, **results}
     spread = {f"{key}_std": abs(value) * 0.04 for key, value in results.items()}
-    names = {"experiment_name": scene, "method_name": method, "checkpoint": checkpoint}
-    return {**names, "results": results | spread}
+    return {"experiment_name": scene, "method_name": method, "results": results | spread}
 
 
 def view(path: Path, index: int, noise: float, phase: float) -> None:
@@ -51,6 +50,8 @@ def write_results(root: Path) -> Path:
             t = step / 3000
             line = {
                 "step": step,
+                "experiment_name": scene,
+                "method_name": method,
                 "seconds": 0.4 + 310 * t**1.1,
                 "cpu_seconds": 0.7 + 590 * t**1.1,
                 "surfels": int(4000 + (surfels - 4000) * min(1.0, 2 * t) + 300 * math.sin(9 * t)),
@@ -63,13 +64,11 @@ def write_results(root: Path) -> Path:
         shared = {"ssim": ssim, "flip": flip, "surfels": surfels, "fragments_per_pixel": 14.2}
         evals = root / "evals" / scene
         evals.mkdir(parents=True, exist_ok=True)
-        checkpoint = str(run / "nerfstudio_models/step-000002999.ckpt")
-        trained = evaluation(scene, method, checkpoint, psnr=psnr, render_ms=ms, atlas_bytes=0, **shared)
+        trained = evaluation(scene, method, psnr=psnr, render_ms=ms, atlas_bytes=0, **shared)
         (evals / f"{method}.json").write_text(json.dumps(trained, indent=2))
         for name, (delta, texel, share) in FORMATS.items():
-            checkpoint = f"/data/exports/{scene}/{method}-{name}/nerfstudio_models/step-000002999.ckpt"
             figures = dict(psnr=psnr + delta, render_ms=ms * share, atlas_bytes=surfels * 190 * texel)
-            baked = evaluation(scene, f"{method}-bundle", checkpoint, **figures, **shared)
+            baked = evaluation(scene, method, bundle_bytes=surfels * 200 * texel, **figures, **shared)
             (evals / f"{method}-{name}.json").write_text(json.dumps(baked, indent=2))
         if method == "bitymi":
             phase = 0.5 * list(RUNS).index((scene, method))  # other photographs in every scene
@@ -142,10 +141,10 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def eval_json(tmp_path: Path):
     """Return a function that writes an evaluation and returns its path."""
 
-    def write(name: str = "eval.json", scene: str = "fox", method: str = "bitymi", checkpoint: str = "", **results):
+    def write(name: str = "eval.json", scene: str = "fox", method: str = "bitymi", **results):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(evaluation(scene, method, checkpoint, **results)))
+        path.write_text(json.dumps(evaluation(scene, method, **results)))
         return path
 
     return write

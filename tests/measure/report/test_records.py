@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.measure.report.read import collect, parse_json, read_jsonl
-from bitymi_ns.measure.report.records import ReportError, evaluation_from, over_seeds, psnr_delta, trained_parent
+from bitymi_ns.measure.report.records import ReportError, evaluation_from, over_seeds, trained_parent
 from tests.measure.report.conftest import cell, figures, write_lines
 
 
-def make(scene="fox", method="bitymi", checkpoint="", source="a/eval.json", **results):
-    data = {"experiment_name": scene, "method_name": method, "checkpoint": checkpoint, "results": results}
+def make(scene="fox", method="bitymi", source="a/eval.json", **results):
+    data = {"experiment_name": scene, "method_name": method, "results": results}
     return evaluation_from(data, Path(source))
 
 
@@ -26,27 +26,21 @@ def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("results", "baked"),
-    [({}, False), ({"atlas_bytes": 0}, False), ({"atlas_bytes": 4096}, True), ({"bundle_bytes": 9}, True)],
+    [({}, False), ({"atlas_bytes": 0}, False), ({"bundle_bytes": 9}, True)],
 )
 @pytest.mark.parametrize("method", ["bitymi", "half-baked", "bundle"])
 def test_a_bundle_states_its_bytes_and_a_run_has_none(method: str, results: dict[str, float], baked: bool) -> None:
-    checkpoint = "/half-baked/bundle/nerfstudio_models/step-1.ckpt"
-    assert make(method=method, checkpoint=checkpoint, psnr=20.0, **results).baked is baked
-
-
-def test_label_of_a_bundle_names_its_format():
-    row = make(checkpoint="/e/fox-bc7/nerfstudio_models/step-0.ckpt", atlas_bytes=10)
-    assert row.label == "bitymi, bc7"
+    assert make(method=method, psnr=20.0, **results).baked is baked
 
 
 def test_trained_parent_is_of_the_same_folder_when_there_are_several():
     first, second = make(source="run1/trained.json", psnr=20.0), make(source="run2/trained.json", psnr=21.0)
-    baked = make(source="run2/baked.json", atlas_bytes=1, psnr=20.9)
+    baked = make(source="run2/baked.json", bundle_bytes=1, psnr=20.9)
     assert trained_parent(baked, [first, second, baked]) is second
-    elsewhere = make(source="run3/baked.json", atlas_bytes=1)
+    elsewhere = make(source="run3/baked.json", bundle_bytes=1)
     assert trained_parent(elsewhere, [first, second]) is None
     assert trained_parent(first, [first, second]) is None
-    assert trained_parent(make(scene="lego", source="run1/x.json", atlas_bytes=1), [first, second]) is None
+    assert trained_parent(make(scene="lego", source="run1/x.json", bundle_bytes=1), [first, second]) is None
 
 
 def test_curve_keeps_the_last_line_of_a_repeated_step_and_leaves_out_a_cut_last_line(tmp_path: Path):
@@ -82,11 +76,6 @@ def test_results_folder(results: Path, tmp_path: Path):
     }
     assert len(records.images) == 29
     assert len(records.notes) == 1
-
-
-def test_curve_is_named_by_the_run_folders_without_an_evaluation(results: Path, tmp_path: Path):
-    (curve,) = collect([results / "outputs/fox/bitymi"], tmp_path / "report").curves
-    assert (curve.scene, curve.label) == ("fox", "bitymi")
 
 
 def test_namesakes_get_different_labels(eval_json, tmp_path: Path):
@@ -139,7 +128,7 @@ def test_a_bundle_of_one_seed_is_compared_with_that_seed(work: Path, tmp_path: P
     merged = over_seeds(only)
     assert len(only) == 3 and [row.baked for row in merged] == [False, True]
     before, after = (row.results["psnr"] for row in only if row.seed == 0)
-    assert psnr_delta(merged[1], merged) == pytest.approx(after - before)
+    assert merged[1].results["psnr_delta"] == pytest.approx(after - before)
 
 
 def test_of_equal_keys_the_last_line_counts(tmp_path: Path) -> None:

@@ -16,15 +16,15 @@ def make(scene="fox", method="bitymi", source="a/eval.json", **results):
 def test_layout_before_and_after_baking():
     rows = [
         make(psnr=27.40, flip=0.12, render_ms=50.0, surfels=12345, atlas_bytes=0),
-        make(psnr=27.38, flip=0.12, render_ms=10.0, surfels=12345, atlas_bytes=2_500_000, method="bitymi-bundle"),
+        make(psnr=27.38, flip=0.12, render_ms=10.0, surfels=12345, bundle_bytes=2_500_000),
     ]
     (table,) = quality_tables(rows)
-    assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Atlas MB ↓", "Points ↓", "ms ↓", "FPS ↑", "ΔPSNR")
+    assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Bundle MB ↓", "Points ↓", "ms ↓", "ΔPSNR")
     before, trained, after, baked = table.rows
     assert before.section and after.section
-    assert trained.cells == ("bitymi", "27.40", "0.120", "–", "12,345", "50.0", "20.0", "–")
-    assert baked.cells == ("bitymi", "27.38", "0.120", "2.50", "12,345", "10.0", "100", "−0.020")
-    assert trained.best == {1} and baked.best == {5, 6}  # equal columns have no best
+    assert trained.cells == ("bitymi", "27.40", "0.120", "–", "12,345", "50.0", "–")
+    assert baked.cells == ("bitymi", "27.38", "0.120", "2.50", "12,345", "10.0", "−0.020")
+    assert trained.best == {1} and baked.best == {5}  # equal columns have no best
 
 
 def test_bytes_are_in_sight_in_a_window_of_1280_pixels(tmp_path):
@@ -33,7 +33,7 @@ def test_bytes_are_in_sight_in_a_window_of_1280_pixels(tmp_path):
     every |= dict(psnr=27.4, fitted_psnr=27.4, surfels=1_234_567, render_ms=123.4, fragments_per_pixel=48.3)
     every |= dict(atlas_bytes=123_456_789, bundle_bytes=23_456_789)
     trained = {key: value for key, value in every.items() if "bytes" not in key}
-    rows = [make(method="bitymi-quality", **trained), make(method="bitymi-quality-bundle", **every)]
+    rows = [make(method="bitymi-quality", **trained), make(method="bitymi-quality", **every)]
     main, fitted = quality_tables(rows)
     assert main.header[-1] == "ΔPSNR" and main.header.index("Bundle MB ↓") < main.header.index("Points ↓")
     assert fitted.title == "fox, exposure aside"
@@ -64,7 +64,7 @@ def test_means_only_over_what_covers_the_same_scenes():
 def test_names_cannot_break_the_table():
     table = Table("t", ("Method", "A"), (Row(("<script>a|b</script>", "1"), frozenset({1})),))
     title = table.rows[0].cells[0]
-    page = page_of(title=title, notes=[title], quality=[table], training=table)
+    page = page_of(title=title, notes=[title], quality=[table, table])
     assert "<script>" not in page and page.count("<th>&lt;script&gt;a|b&lt;/script&gt;</th>") == 2
     assert page.count("<td><b>1</b></td>") == 2 and "<title>&lt;script&gt;a|b&lt;/script&gt;</title>" in page
     assert to_markdown(table).splitlines()[2] == "| <script>a\\|b</script> | **1** |"

@@ -4,30 +4,70 @@ of view colour, limits."""
 
 import math
 import re
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 
-from bitymi_ns.codec import packing, surfel_codes
-from bitymi_ns.codec.limits import EXTENTS, LIMITS, UNIT_SLACK, limit_of
-from bitymi_ns.ops.constants import ALPHA_MIN, MAX_TERMS, SUPPORT
-from bitymi_ns.ops.parameters import GEOMETRY, Limit
-from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
-from bitymi_ns.ops.webgpu.arrays import KINDS, SURFEL, WHOLE
+import numpy as np
 
+from bitymi_ns.bundle import compact, manifest
+from bitymi_ns.bundle.surfel_table import COLUMNS
+from bitymi_ns.bundle.world import WorldEntry
+from bitymi_ns.codec import limits, packing, surfel_codes, texel_codes
+from bitymi_ns.codec.limits import LIMITS, limit_of
+from bitymi_ns.ops import constants, view_kinds
+from bitymi_ns.ops.constants import MAX_TERMS, SUPPORT
+from bitymi_ns.ops.parameters import GEOMETRY, Limit
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.ops.webgpu import on_device
+from bitymi_ns.ops.webgpu.arrays import FIELDS, FRAME, KINDS, SEEN, SURFEL, WHOLE
+
+WIDTH = 120  # of lines
 FILE = Path(__file__).resolve().parents[1] / "web" / "src" / "bundle" / "tables.ts"
-STORED = {**{name: name.removesuffix("s") for name in GEOMETRY}, "mean_residual": "residual", "view_base": "base"}
-"""Fields of `SURFEL` by parameter."""
+PARTS = {
+    "surfels": manifest.Surfels,
+    "frame": manifest.PositionFrame,
+    "columns": manifest.ColumnEntry,
+    "atlas": manifest.AtlasEntry,
+    "render": manifest.RenderEntry,
+    "bounds": manifest.Bounds,
+    "world": WorldEntry,
+    "files": manifest.FileEntry,
+}
+"""Parts of bundle.json that the page reads."""
+TYPES = {
+    "EARLIER": "Record<string, string>",
+    "LEAN_COUNTS": "Record<string, readonly number[] | null>",
+    "LINEAR": "Record<string, { at: number; limit: number; least: number | null }>",
+    "RANGES": "Record<string, readonly [number, number]>",
+    "STEPPED": "readonly string[]",
+}
+"""Types of tables that are indexed by what a file holds."""
+NUMBERS = {
+    constants: "MAX_TERMS",
+    view_kinds: "COLOR_LIMIT",
+    limits: "EXTENTS UNIT_SLACK",
+    surfel_codes: "POSITION_BITS SMALLEST_SHARE",
+    packing: "GRID ROWS",
+    compact: "SURFELS_PER_BYTE SPARE_SURFELS TEXELS_PER_BYTE SPARE_TEXELS MOST_EXPONENT MOST_COEFFICIENT",
+    texel_codes: "GRADES",
+    on_device: "BLOCK DIGITS ROUNDS MOST_LAYERS",
+}
+"""Numbers with the same name on the page."""
 
 
 def text_of(value: object) -> str:
-    """Write a value as TypeScript, as prettier formats it."""
+    """Write a value as TypeScript."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key_of(key)}: {text_of(item)}" for key, item in value.items()) + " }"
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(text_of(item) for item in value) + "]"
     if isinstance(value, float):
-        rounded = round(math.log10(value))
-        return f"1e{rounded}" if value == 10.0**rounded and abs(rounded) > 3 else repr(value).removesuffix(".0")
+        return (
+            re.sub(r"^(-?1)(0{4,})\.0$", lambda part: f"{part[1]}e{len(part[2])}", repr(value))
+            .replace("e-0", "e-")
+            .removesuffix(".0")
+        )
     return "null" if value is None else f"'{value}'" if isinstance(value, str) else str(value)
 
 
@@ -41,10 +81,36 @@ def of_width(limit: Limit, width: int) -> list[float]:
     return list(limit) if len(limit) > 1 else list(limit) * width
 
 
+def ranges() -> dict[str, list[float]]:
+    """List the ranges of bundle.json's numbers by part and key, those of a list's items by the list's."""
+    found = {}
+    for part, model in PARTS.items():
+        for key, schema in model.model_json_schema()["properties"].items():
+            while (
+                inner := schema.get("anyOf")
+                or schema.get("prefixItems")
+                or ([schema["items"]] if "items" in schema else ())
+            ):
+                schema = inner[0]
+            if "maximum" in schema:
+                low = schema.get("minimum", math.ulp(schema.get("exclusiveMinimum", 0.0)))
+                found[f"{part}.{key}"] = [low, schema["maximum"]]
+    return found
+
+
+def words_of(struct: np.dtype) -> dict[str, int]:
+    """List the offsets of a struct's fields in words, by name."""
+    return {re.sub(r"_(\w)", lambda part: part[1].upper(), name): at // 4 for name, (_, at) in struct.fields.items()}
+
+
+def at_word(parameter: str) -> tuple[int, int]:
+    """Return a parameter's first word of a surfel, and their number."""
+    field = FIELDS[parameter]
+    return SURFEL.fields[field][1] // 4, math.prod(SURFEL[field].shape)
+
+
 def tables() -> str:
     """Write the module."""
-    fields = {name: offset // 4 for name, (_, offset) in SURFEL.fields.items()}
-    words = {re.sub(r"_(\w)", lambda part: part[1].upper(), name): at for name, at in fields.items()}
     kinds = VIEW_COLORS.items()
     terms = {name: of_width(kind.lean_limit, kind.lean_width) for name, kind in kinds}
     shapes = {name: surfel_codes.term_numbers(name)[1] for name in VIEW_COLORS}
@@ -59,16 +125,29 @@ def tables() -> str:
             "base": base[0] if base else None,
             "kind": KINDS[form],
         }
-    stored = {
-        name: [fields[field], math.prod(SURFEL[field].shape), LIMITS[name][0]]
-        for name, field in STORED.items()
-        if math.isfinite(LIMITS[name][0])
-    }
-    constants = {
+    stored = {name: [*at_word(name), LIMITS[name][0]] for name in FIELDS if math.isfinite(LIMITS[name][0])}
+    found = {
+        "FORMAT": manifest.FORMAT,
+        "NEWEST_MAJOR": int(manifest.VERSION.split(".")[0]),
+        "EARLIER": manifest.EARLIER,
+        "RANGES": ranges(),
         "SURFEL_WORDS": SURFEL.itemsize // 4,
-        "WORD": words,
+        "WORD": words_of(SURFEL),
+        "SEEN_BYTES": SEEN.itemsize,
+        "FRAME_BYTES": FRAME.itemsize,
+        "FRAME": words_of(FRAME),
+        "PLY": {column: at_word(name)[0] + i for name in GEOMETRY for i, column in enumerate(COLUMNS[name])},
+        "COLUMNS": {k: n for k, n in surfel_codes.columns_of("sv", True).items() if not k.startswith("term_")},
+        "STEPPED": [*surfel_codes.REFERENCE, "residual"],
+        "LINEAR": {
+            column: {"at": at_word(p.name)[0], "limit": p.limit[0], "least": p.least}
+            for column, p in surfel_codes.LINEAR.items()
+        },
         "KINDS": KINDS,
         "LEAN_WIDTH": {name: kind.lean_width for name, kind in kinds},
+        "LEAN_COUNTS": {
+            name: None if kind.lean_counts == range(MAX_TERMS + 1) else list(kind.lean_counts) for name, kind in kinds
+        },
         "TERM_LIMITS": terms,
         "SHAPES": {
             name: {"at": min(at, default=0), "limits": [of_width(limit_of("view_terms", name), 9)[i] for i in at]}
@@ -76,24 +155,20 @@ def tables() -> str:
         },
         "WHOLE": whole,
         "LIMITS": stored,
-        "COLOR_LIMIT": COLOR_LIMIT,
-        "EXTENTS": EXTENTS,
         "EXTENT": SUPPORT,
-        "UNIT_SLACK": UNIT_SLACK,
-        "ALPHA_MIN": ALPHA_MIN,
-        "MAX_TERMS": MAX_TERMS,
-        "POSITION_BITS": surfel_codes.POSITION_BITS,
-        "SMALLEST_SHARE": surfel_codes.SMALLEST_SHARE,
-        "GRID": packing.GRID,
-        "ROWS": packing.ROWS,
+        **{name: getattr(module, name) for module, names in NUMBERS.items() for name in names.split()},
     }
     lines = ["// Written by scripts/page_tables.py."]
-    for name, value in constants.items():
-        if isinstance(value, Mapping):
-            lines += [f"export const {name} = {{", *(f"  {key_of(k)}: {text_of(v)}," for k, v in value.items())]
-            lines.append("} as const;")
-        else:
-            lines.append(f"export const {name} = {text_of(value)}{' as const' if isinstance(value, tuple) else ''};")
+    for name, value in found.items():
+        named = f"{name}: {TYPES[name]}" if name in TYPES else name
+        end = "" if name in TYPES or isinstance(value, (str, int, float)) else " as const"
+        text = f"export const {named} = {text_of(value)}{end};"
+        if len(text) > WIDTH and isinstance(value, Mapping):
+            nested = any(isinstance(item, Mapping) for item in value.values())
+            entries = [f"{key_of(key)}: {text_of(item)},".replace(" ", "\0") for key, item in value.items()]
+            rows = entries if nested else textwrap.wrap(" ".join(entries), WIDTH - 2)
+            text = "\n  ".join([f"export const {named} = {{", *rows]).replace("\0", " ") + f"\n}}{end};"
+        lines.append(text)
     return "\n".join(lines) + "\n"
 
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.codec.surfel_codes import PARAMETERS, REFERENCE, SurfelCodes, code_surfels, reordered, term_numbers
+from bitymi_ns.codec.surfel_codes import CODED, REFERENCE, SurfelCodes, code_surfels, reordered, term_numbers
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.losses import psnr
@@ -115,7 +115,7 @@ def column_noise(
 def _column(scene: BakedScene, codes: SurfelCodes, rounded: Mapping[str, Tensor], column: str) -> dict[str, Tensor]:
     """Replace a column's numbers in its parameter by the rounded ones."""
     if column not in ("term_shape", "term_color"):
-        name = PARAMETERS.get(column, column)
+        name = CODED.get(column, column)
         return {name: rounded[name]}
     at, terms = term_numbers(codes.kind)[column == "term_shape"], scene.surfels["view_terms"].clone()
     terms[:, at] = rounded["view_terms"][:, at]

@@ -15,7 +15,7 @@ from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, AtlasEntry, Colum
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.streams import StreamError
-from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, Codes, PositionGrid, SurfelCodes, term_numbers
+from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, Codes, PositionGrid, SurfelCodes, columns_of
 from bitymi_ns.codec.texel_codes import GRADES, AlphaCodes, TexelCodes, blocks_of, coefficient_columns
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 
@@ -28,7 +28,7 @@ scenes have a surfel per 12 bytes or more and at most 5 texels per byte. Flat ti
 the sum of both files counts for texels."""
 SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
 MOST_EXPONENT = 12  # largest log2 of a tile side
-_MOST_COEFFICIENT = 1 << 24
+MOST_COEFFICIENT = 1 << 24
 
 
 def encode_surfels(
@@ -45,8 +45,8 @@ def encode_surfels(
     if alpha is not None:
         columns["alpha"] = alpha[:, None]
     steps = {**codes.steps, "residual": residual_step}
-    names = _surfel_columns(codes.kind, alpha is not None)[0]
-    described, data = _compressed({name: columns[name] for name in names}, steps, digest)
+    columns = {name: columns[name] for name in columns_of(codes.kind, alpha is not None)}
+    described, data = _compressed(columns, steps, digest)
     frame = {"center": codes.frame.center, "scale": codes.frame.scale, "low": codes.frame.low}
     return {"frame": frame, "columns": described}, data
 
@@ -57,9 +57,9 @@ def decode_surfels(
     """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] if it has them. Raises
     StreamError: the file is damaged, contradicts bundle.json, or holds a number out of range."""
     assert info.columns is not None and info.frame is not None
-    names, numbers = _surfel_columns(info.view_color, has_alpha)
-    steps = _check_columns(info.columns, names, numbers, (*REFERENCE, "residual"))
-    rows = dict.fromkeys(names, info.count) | dict.fromkeys(("term_shape", "term_color"), info.terms or 0)
+    numbers = columns_of(info.view_color, has_alpha)
+    steps = _check_columns(info.columns, numbers, (*REFERENCE, "residual"))
+    rows = dict.fromkeys(numbers, info.count) | dict.fromkeys(("term_shape", "term_color"), info.terms or 0)
     codes: dict[str, Codes] = {}
     for column, part in zip(info.columns, _parts(data, info.columns), strict=True):
         if column.name == "extent":
@@ -139,7 +139,7 @@ def decode_texels(
     names, alphas = coefficient_columns(blocks)
     alphas = [] if alpha is None else alphas
     numbers = {"grade": 1} | dict.fromkeys(names, 3) | dict.fromkeys(alphas, 1)
-    steps = set(_check_columns(info.columns, list(numbers), numbers, alphas).values())
+    steps = set(_check_columns(info.columns, numbers, alphas).values())
     if len(steps) > 1:
         raise StreamError("the columns of alphas have different steps")
     parts = _parts(data, info.columns)
@@ -150,8 +150,8 @@ def decode_texels(
     coefficients = []
     for each, column, part in zip([*blocks, *blocks[: len(alphas)]], info.columns[1:], parts, strict=True):
         values = _decompressed(part, each.texels.numel(), column, digest, len(each.texels))
-        if np.abs(values).max(initial=0) > _MOST_COEFFICIENT:
-            raise StreamError(f"a coefficient of {column.name} is beyond {_MOST_COEFFICIENT}")
+        if np.abs(values).max(initial=0) > MOST_COEFFICIENT:
+            raise StreamError(f"a coefficient of {column.name} is beyond {MOST_COEFFICIENT}")
         narrow = torch.from_numpy(values.astype(np.int32, order="C"))
         coefficients.append(narrow.view(-1, len(each.texels), values.shape[1]))
     coded = None if alpha is None else AlphaCodes(alpha, steps.pop() if steps else 1.0, coefficients[len(blocks) :])
@@ -190,21 +190,12 @@ def check_texels_size(info: AtlasEntry, size: int, surfels: int) -> None:
         raise StreamError(f"{info.texels} texels cannot be in {size} bytes, and {surfels} of {COMPACT_SURFELS}")
 
 
-def _surfel_columns(kind: str, has_alpha: bool) -> tuple[list[str], dict[str, int]]:
-    """List the columns of surfels.bin in order, and the numbers per row of each."""
-    colors, shapes = term_numbers(kind)
-    numbers = {"place": 1, "largest": 1, "rotation": 3, "log_scales": 2, "opacity": 1, "beta": 1, "size": 1}
-    numbers |= {"residual": 3, **({"alpha": 1} if has_alpha else {}), "view_base": 3, "extent": 1, "view_count": 1}
-    numbers |= {"term_shape": len(shapes), "term_color": len(colors)}
-    return list(numbers), numbers
-
-
 def _check_columns(
-    columns: Sequence[ColumnEntry], names: Sequence[str], numbers: dict[str, int], stepped: Sequence[str]
+    columns: Sequence[ColumnEntry], numbers: Mapping[str, int], stepped: Sequence[str]
 ) -> dict[str, float]:
     found = [column.name for column in columns]
-    if found != list(names):
-        raise StreamError(f"the columns are {found}, not {list(names)}")
+    if found != list(numbers):
+        raise StreamError(f"the columns are {found}, not {list(numbers)}")
     steps = {}
     for column in columns:
         if len(column.bytes) != numbers[column.name]:

@@ -10,21 +10,19 @@ from torch import Tensor
 
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.limits import EXTENTS, LIMITS, limit_of
-from bitymi_ns.ops.constants import ALPHA_MIN
-from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
+from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS, SMALLEST_SHARE, Parameter
 from bitymi_ns.ops.view_color import LEAN
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
 
 Codes = npt.NDArray[np.int64]
 
 POSITION_BITS = 17  # bits per axis of a position: three axes fit exactly into a float64
-SMALLEST_SHARE = 1.0 / 1024  # margin of opacities to 1, and of betas to 0 and 1, where the logit is infinite
+LINEAR = {parameter.code or name: parameter for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.step}
+"""Parameters whose numbers are coded one by one, by column."""
 REFERENCE: dict[str, float] = {
     "place": 1.0 / 512,
     "rotation": 1.0 / 128,
-    "log_scales": 1.0 / 32,
-    "opacity": 1.0 / 64,
-    "beta": 1.0 / 32,
+    **{column: parameter.step for column, parameter in LINEAR.items() if parameter.step},
     "extent": 1.0 / 16,
     "view_base": 1.0 / 96,
     "term_shape": 1.0 / 12,
@@ -32,8 +30,16 @@ REFERENCE: dict[str, float] = {
 }
 """Reference steps of the columns whose precision is chosen; near them an error is about proportional to its step.
 Units: place (positions) as in `PositionGrid`, opacity and beta shares of their ranges, term_shape asinh."""
-PARAMETERS = {parameter.code: name for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.code}
+CODED = {parameter.code: name for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.code}
 """Surfel parameter of each column whose name differs."""
+
+
+def columns_of(kind: str, has_alpha: bool) -> dict[str, int]:
+    """Count the numbers per row of the columns of surfels.bin, in their order."""
+    colors, shapes = term_numbers(kind)
+    numbers = {"place": 1, "largest": 1, "rotation": 3, **{column: p.width for column, p in LINEAR.items()}, "size": 1}
+    numbers |= {"residual": 3, **({"alpha": 1} if has_alpha else {}), "view_base": 3, "extent": 1, "view_count": 1}
+    return numbers | {"term_shape": len(shapes), "term_color": len(colors)}
 
 
 @dataclass(frozen=True)
@@ -95,9 +101,7 @@ class SurfelCodes:
         values = {
             "means": self._means(),
             "quats": self._rotations(),
-            "log_scales": self._linear("log_scales"),
-            "opacity_logits": _logit(self._linear("opacity")[:, 0], ALPHA_MIN),
-            "beta_raw": _logit(self._linear("beta")[:, 0], SMALLEST_SHARE),
+            **{parameter.name: self._values(column, parameter) for column, parameter in LINEAR.items()},
             "view_base": self.steps["view_base"] * _from_differences(self.codes["view_base"]),
             "view_terms": terms,
         }
@@ -107,6 +111,10 @@ class SurfelCodes:
 
     def _linear(self, name: str) -> npt.NDArray[np.float64]:
         return self.steps[name] * self.codes[name]
+
+    def _values(self, column: str, parameter: Parameter) -> npt.NDArray[np.float64]:
+        values = self._linear(column).reshape(-1, *parameter.shape)
+        return values if parameter.least is None else _logit(values, parameter.least)
 
     def _means(self) -> npt.NDArray[np.float64]:
         frame = self.frame
@@ -153,9 +161,7 @@ def code_surfels(
         "place": position[:, None],
         "largest": largest[:, None],
         "rotation": _quantise(rest, steps["rotation"]),
-        "log_scales": _quantise(values["log_scales"], steps["log_scales"]),
-        "opacity": _quantise(_sigmoid(values["opacity_logits"])[:, None], steps["opacity"]),
-        "beta": _quantise(_sigmoid(values["beta_raw"])[:, None], steps["beta"]),
+        **{column: _quantise(_coded(values[p.name], p), steps[column]) for column, p in LINEAR.items()},
         "size": np.where(tiled, 16 * exponents[:, 0] + exponents[:, 1], 0)[:, None],
         "view_base": _to_differences(_quantise(values["view_base"], steps["view_base"])),
         "view_count": values["view_span"][:, 1:].astype(np.int64),
@@ -219,6 +225,10 @@ def _term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 def _quantise(values: npt.NDArray[np.float64], step: float) -> Codes:
     return np.rint(values / step).astype(np.int64)
+
+
+def _coded(values: npt.NDArray[np.float64], parameter: Parameter) -> npt.NDArray[np.float64]:
+    return (values if parameter.least is None else _sigmoid(values)).reshape(len(values), parameter.width)
 
 
 def _to_differences(rgb: Codes) -> Codes:

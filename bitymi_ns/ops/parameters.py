@@ -7,6 +7,7 @@ from dataclasses import dataclass
 Limit = tuple[float, ...]
 """Largest absolute value of a parameter: one number, or one for each entry of its last axis."""
 SHAPE_LIMIT = 1e4  # of logits, angles and log sharpnesses: sigmoid and exp saturate far below
+SMALLEST_SHARE = 1.0 / 1024  # margin of stored sigmoids to 1, and of betas to 0, where the logit is infinite
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,10 @@ class Parameter:
     activation: str | None = None  # activation of a view colour as stated in bundle.json; None: not stated
     columns: tuple[str, ...] | None = None  # columns of surfels.ply; None: <name>_<i>
     code: str | None = None  # column of surfels.bin; None: its name
+    step: float | None = (
+        None  # reference step of that column, whose codes are linear; None: `codec.surfel_codes` has it
+    )
+    least: float | None = None  # the codes are of sigmoids, from this to 1 - `SMALLEST_SHARE`; None: of the values
 
     @property
     def width(self) -> int:
@@ -36,9 +41,21 @@ GEOMETRY_PARAMETERS: dict[str, Parameter] = {
             *("quats", (4,), (math.inf,), "quats"), columns=("rot_0", "rot_1", "rot_2", "rot_3"), code="rotation"
         ),
         # beyond, exp() is 0 or infinite in float32
-        Parameter("log_scales", (2,), (104.0,), "log_scales", columns=("scale_0", "scale_1")),
-        Parameter(*("opacity_logits", (), (SHAPE_LIMIT,), "opacity_logits"), columns=("opacity",), code="opacity"),
-        Parameter("beta_raw", (), (SHAPE_LIMIT,), "beta_raw", columns=("beta",), code="beta"),
+        Parameter("log_scales", (2,), (104.0,), "log_scales", columns=("scale_0", "scale_1"), step=1.0 / 32),
+        Parameter(
+            *("opacity_logits", (), (SHAPE_LIMIT,), "opacity_logits"),
+            columns=("opacity",),
+            code="opacity",
+            step=1.0 / 64,
+            least=1.0 / 255,  # `constants.ALPHA_MIN`
+        ),
+        Parameter(
+            *("beta_raw", (), (SHAPE_LIMIT,), "beta_raw"),
+            columns=("beta",),
+            code="beta",
+            step=1.0 / 32,
+            least=SMALLEST_SHARE,
+        ),
     )
 }
 """Geometry of a surfel by name, in the order of the kernels."""

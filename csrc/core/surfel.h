@@ -49,43 +49,58 @@ template <class S, class T> BT_HD T slope(const S* g, GeomColumn first, T dx, T 
   return T(g[first]) * dx + T(g[first + 1]) * dy;
 }
 
-// Geometry of n surfels: [n, 3], [n, 4] wxyz, [n, 2], [n], [n].
+// Parameters of a surfel's geometry and their numbers, as `ops.parameters.GEOMETRY_PARAMETERS` in Python. Structs,
+// loads, checks and arguments follow from it.
+#define BT_GEOMETRY(each) each(means, 3) each(quats, 4) each(log_scales, 2) each(opacity_logits, 1) each(beta_raw, 1)
+
+// Geometry of n surfels.
 template <class S> struct Surfels {
   int64_t n;
-  const S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+#define BT_EACH(name, count) const S* name;
+  BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
 
   template <class R>  // as in ops/arguments.h
   void fields(R& r) {
-    r.rows("opacity_logits", opacity_logits, n, 1);
-    r.array("means", means, 3 * n);
-    r.array("quats", quats, 4 * n);
-    r.array("log_scales", log_scales, 2 * n);
-    r.array("beta_raw", beta_raw, n);
+    r.rows("means", means, n, 3);
+#define BT_EACH(name, count) r.array(#name, name, count* n);
+    BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
   }
 };
 template <class S> struct SurfelGradients {
-  S *means, *quats, *log_scales, *opacity_logits, *beta_raw;
+#define BT_EACH(name, count) S* name;
+  BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
 
   template <class R> void fields(R& r, int64_t n) {
-    r.array("dmeans", means, 3 * n);
-    r.array("dquats", quats, 4 * n);
-    r.array("dlog_scales", log_scales, 2 * n);
-    r.arrays(n, "dopacity_logits", opacity_logits, "dbeta_raw", beta_raw);
+#define BT_EACH(name, count) r.array("d" #name, name, count* n);
+    BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
   }
 };
 
 // One surfel, or one per lane.
 template <class T> struct SurfelRow {
-  Vec3<T> mean;
-  T quat[4], log_scale[2], opacity_logit, beta_raw;
+#define BT_EACH(name, count) T name[count];
+  BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
 };
 template <class S> BT_HD SurfelRow<S> surfel_row(const Surfels<S>& in, int64_t i) {
-  const S *q = in.quats + 4 * i, *log_scale = in.log_scales + 2 * i;
-  return {load3(in.means + 3 * i),
-          {q[0], q[1], q[2], q[3]},
-          {log_scale[0], log_scale[1]},
-          in.opacity_logits[i],
-          in.beta_raw[i]};
+  SurfelRow<S> row;
+#define BT_EACH(name, count) \
+  for (int k = 0; k < count; ++k) row.name[k] = in.name[count * i + k];
+  BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
+  return row;
+}
+template <class T> BT_HD MaskOf<T> surfel_finite(const SurfelRow<T>& row) {
+  MaskOf<T> finite = finite_(row.means[0]);
+#define BT_EACH(name, count) \
+  for (const T& number : row.name) finite = finite & finite_(number);
+  BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
+  return finite;
 }
 
 // Rotation matrix columns of a quaternion wxyz of any length.
@@ -142,7 +157,8 @@ template <class T> struct WorldSurfel {
   Vec3<T> p;
 };
 template <class S, class T> BT_HD WorldSurfel<T> world_surfel(const Pinhole<S>& cam, const SurfelRow<T>& in) {
-  return {rotation(in.quat), surfel_scale(in.log_scale[0]), surfel_scale(in.log_scale[1]), to_camera(cam, in.mean)};
+  return {rotation(in.quats), surfel_scale(in.log_scales[0]), surfel_scale(in.log_scales[1]),
+          to_camera(cam, load3(in.means))};
 }
 // A surfel in the camera frame: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and scales.
 template <class S, class T> struct CameraSurfel {
@@ -175,15 +191,14 @@ BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T
   g[kV1] = sign * pa.x * T(ifx) * isv, g[kV2] = sign * pa.y * T(ify) * isv;
   g[kW0] = sign * np * iz, g[kW1] = sign * n.x * T(ifx), g[kW2] = sign * n.y * T(ify);
   g[kZ] = p.z;
-  g[kOpacity] = sigmoid(in.opacity_logit);
-  g[kBeta] = T(kBetaMax) * sigmoid(in.beta_raw);
+  g[kOpacity] = sigmoid(in.opacity_logits[0]);
+  g[kBeta] = T(kBetaMax) * sigmoid(in.beta_raw[0]);
   g[kNx] = -sign * n.x, g[kNy] = -sign * n.y, g[kNz] = -sign * n.z;
   g[kLowPassHeight] = T(0.0f);
-  MaskOf<T> ok = rot.ok & finite_(p.x) & finite_(p.y) & (p.z > T(near)) & finite_(in.log_scale[0]);
-  ok = ok & finite_(in.log_scale[1]) & finite_(in.opacity_logit) & finite_(in.beta_raw);
+  MaskOf<T> ok = rot.ok & surfel_finite(in) & finite_(p.x) & finite_(p.y) & (p.z > T(near));
   for (int i = 0; i < kGeom; ++i) ok = ok & finite_(g[i]);
   const Vec3<T> tu = su * rot.tu, tv = sv * rot.tv;
-  const T f[kFrame] = {in.mean.x, in.mean.y, in.mean.z, tu.x, tu.y, tu.z, tv.x, tv.y, tv.z};
+  const T f[kFrame] = {in.means[0], in.means[1], in.means[2], tu.x, tu.y, tu.z, tv.x, tv.y, tv.z};
   for (int i = 0; i < kFrame; ++i) frame[i] = f[i];
   return ok;
 }
@@ -193,16 +208,17 @@ BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T
 template <class S>
 BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, const S* geom, const S* dgeom,
                        const S* dframe, const SurfelGradients<S>& out) {
-  S *dquat = out.quats + 4 * i, *dlog_scales = out.log_scales + 2 * i;
   if (geom[kZ] == S(0)) {
-    store3(out.means + 3 * i, Vec3<S>{S(0), S(0), S(0)});
-    for (int k = 0; k < 4; ++k) dquat[k] = S(0);
-    dlog_scales[0] = dlog_scales[1] = out.opacity_logits[i] = out.beta_raw[i] = S(0);
+#define BT_EACH(name, count) \
+  for (int k = 0; k < count; ++k) out.name[count * i + k] = S(0);
+    BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
     return;
   }
   const S none[kFrame] = {};
   if (!dframe) dframe = none;
   const S* log_scales = in.log_scales + 2 * i;
+  S* dlog_scales = out.log_scales + 2 * i;
   const WorldSurfel<S> at = world_surfel(cam, surfel_row(in, i));
   const auto& [rot, su, sv, p] = at;
   const auto [a, b, n, np, sign, iz, isu, isv, ifx, ify] = camera_surfel(cam, at);
@@ -229,7 +245,7 @@ BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, c
   const S gsv = -(dgeom[kV1] * geom[kV1] + dgeom[kV2] * geom[kV2]) + sv * dot(dtv, rot.tv);
   const S dopacity = dgeom[kOpacity] * geom[kOpacity], dbeta = dgeom[kBeta] * geom[kBeta];
   store3(out.means + 3 * i, dmean);
-  rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), dquat);
+  rotation_vjp(rot, gu, gv, rotate_transposed(cam.R, dn), out.quats + 4 * i);
   dlog_scales[0] = scale_moves(log_scales[0]) ? gsu : S(0);
   dlog_scales[1] = scale_moves(log_scales[1]) ? gsv : S(0);
   out.opacity_logits[i] = dopacity * sigmoid(-in.opacity_logits[i]);

@@ -6,14 +6,6 @@
 
 namespace bt {
 
-template <class S> BT_HD bool surfel_finite(const Surfels<S>& in, int64_t i) {
-  bool finite = finite_(in.opacity_logits[i]) && finite_(in.beta_raw[i]);
-  for (int k = 0; k < 3; ++k) finite &= finite_(in.means[3 * i + k]);
-  for (int k = 0; k < 4; ++k) finite &= finite_(in.quats[4 * i + k]);
-  for (int k = 0; k < 2; ++k) finite &= finite_(in.log_scales[2 * i + k]);
-  return finite;
-}
-
 // Half extents of surfels without a box, in pixels, and the upper bound of others.
 constexpr double kBoxless = 1e6;
 
@@ -41,13 +33,14 @@ template <class Kernel, class S, class Mark>
 BT_HD bool project_visible(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, const Resize<S>& to, S* geom,
                            S* frames, S* radii, Mark&& mark) {
   Sight<S> s;
-  s.projected = project(cam, surfel_row(in, i), near, s.geom, s.frame);
+  const SurfelRow<S> row = surfel_row(in, i);
+  s.projected = project(cam, row, near, s.geom, s.frame);
   if constexpr (Kernel::kResized) s.projected = s.projected && resize(to, s.geom);
   mark(s);
   for (int k = 0; k < kGeom; ++k) geom[i * kGeom + k] = s.seen ? s.geom[k] : S(0);
   for (int k = 0; k < kFrame; ++k) frames[i * kFrame + k] = s.seen ? s.frame[k] : S(0);
   for (int k = 0; k < 2; ++k) radii[2 * i + k] = s.seen ? s.radii[k] : S(0);
-  return s.projected || surfel_finite(in, i);
+  return s.projected || surfel_finite(row);
 }
 
 }  // namespace bt

@@ -10,20 +10,19 @@ namespace bt {
 
 namespace {
 using P = Lanes<float>;
-constexpr int kSurfelColumns = 11;
 
 // Loads surfels begin to begin + n, n <= kLanes, repeating the last one.
 SurfelRow<P> surfel_lanes(const Surfels<float>& in, int64_t begin, int n) {
-  float columns[kSurfelColumns][kLanes];
-  for (int lane = 0; lane < kLanes; ++lane) {
-    const int64_t i = begin + std::min(lane, n - 1);
-    const SurfelRow<float> s = surfel_row(in, i);
-    const float row[kSurfelColumns] = {s.mean.x,  s.mean.y,       s.mean.z,       s.quat[0],       s.quat[1], s.quat[2],
-                                       s.quat[3], s.log_scale[0], s.log_scale[1], s.opacity_logit, s.beta_raw};
-    for (int k = 0; k < kSurfelColumns; ++k) columns[k][lane] = row[k];
+  SurfelRow<P> rows;
+  float numbers[kLanes];
+#define BT_EACH(name, count)                                                                                        \
+  for (int k = 0; k < count; ++k) {                                                                                 \
+    for (int lane = 0; lane < kLanes; ++lane) numbers[lane] = in.name[count * (begin + std::min(lane, n - 1)) + k]; \
+    rows.name[k] = load(numbers);                                                                                   \
   }
-  const auto at = [&](int k) { return load(columns[k]); };
-  return {{at(0), at(1), at(2)}, {at(3), at(4), at(5), at(6)}, {at(7), at(8)}, at(9), at(10)};
+  BT_GEOMETRY(BT_EACH)
+#undef BT_EACH
+  return rows;
 }
 
 // Computes project_visible (core/visibility.h) for lanes of surfels.
@@ -53,12 +52,13 @@ int64_t project_lanes(const Pinhole<float>& cam, const ProjectForward<float>& a,
   int64_t broken = 0;
   for (int64_t i = begin; i < end; i += kLanes) {
     const int n = int(std::min<int64_t>(kLanes, end - i));
-    const Sight<P> s = sight<Kernel>(cam, a.width, a.height, surfel_lanes(a.surfels, i, n), a.near, to);
+    const SurfelRow<P> rows = surfel_lanes(a.surfels, i, n);
+    const Sight<P> s = sight<Kernel>(cam, a.width, a.height, rows, a.near, to);
     const uint32_t seen = bits(s.seen), projected = bits(s.projected);
     store_rows<kGeom>(s.geom, seen, n, a.geom + i * kGeom);
     store_rows<kFrame>(s.frame, seen, n, a.frames + i * kFrame);
     store_rows<2>(s.radii, seen, n, a.radii + 2 * i);
-    for (int lane = 0; lane < n; ++lane) broken += !(projected >> lane & 1) && !surfel_finite(a.surfels, i + lane);
+    broken += __builtin_popcount(~(projected | bits(surfel_finite(rows))) & ((1u << n) - 1u));
   }
   return broken;
 }

@@ -6,12 +6,14 @@ import pytest
 
 from bitymi_ns.ops import constants
 from bitymi_ns.ops.backend import load
+from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
 from bitymi_ns.ops.reference import project, trace
 
 
 def test_the_float64_twins_have_the_same_numbers() -> None:
     assert constants.SUPPORT == trace.SUPPORT
     assert (constants.ALPHA_MIN, constants.ALPHA_MAX) == (trace.ALPHA_MIN, trace.ALPHA_MAX)
+    assert constants.ALPHA_MIN == GEOMETRY_PARAMETERS["opacity_logits"].least
     assert constants.TRANSMITTANCE_MIN == trace.TRANSMITTANCE_MIN
     assert constants.BETA_MAX == project.BETA_MAX
     assert constants.SH_C0 == pytest.approx(math.sqrt(1 / (4 * math.pi)), rel=1e-15)

@@ -1,6 +1,8 @@
 """Conversion of a baked scene to the shaders' arrays (shaders/scene.wgsl)."""
 
+import re
 from dataclasses import dataclass
+from importlib import resources
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +11,7 @@ from torch import Tensor
 
 from ..baked_scene import BakedSceneLike
 from ..constants import SUPPORT
+from ..parameters import GEOMETRY
 from ..view_color import LEAN, check_lean, check_view_color
 from ..view_kinds import VIEW_COLORS
 
@@ -16,14 +19,33 @@ WHOLE = " sites"  # suffix of a kind's form with all sites and no base
 FORMS = [kind + end for kind, entry in VIEW_COLORS.items() for end in (("", WHOLE) if entry.sites else ("",))]
 KINDS = {name: number for number, name in enumerate(FORMS)}
 """Numbers of the view-colour forms in view_color.wgsl."""
-SURFEL = np.dtype(
-    [
-        *(("mean", "<f4", 3), ("opacity_logit", "<f4"), ("quat", "<f4", 4), ("log_scale", "<f4", 2)),
-        *(("beta_raw", "<f4"), ("extent", "<f4"), ("residual", "<f4", 3), ("layer", "<u4"), ("base", "<f4", 3)),
-        *(("first_term", "<u4"), ("tile", "<u4", 2), ("sides", "<u4"), ("terms", "<u4")),
-    ]
-)
-"""Struct `Surfel` of scene.wgsl."""
+
+
+def _struct(name: str) -> np.dtype:
+    """Read the memory layout of a struct of scene.wgsl, by WGSL's rules of alignment."""
+    text = (resources.files("bitymi_ns.ops") / "shaders" / "scene.wgsl").read_text("utf8")
+    body = text.split(f"struct {name} {{")[1].split("\n}")[0]
+    offsets, formats, end = {}, [], 0
+    for field, array, vector, kind, rows in re.findall(
+        r"^  (\w+): (array<)?(?:vec(\d))?([fu])[\w<]*(?:, (\d))?", body, re.M
+    ):
+        width = int(vector or 1)
+        alignment = (4, 8, 16, 16)[width - 1]
+        offsets[field] = -(-end // alignment) * alignment
+        formats.append(np.dtype((f"<{kind}4", (int(rows), width) if array else width if vector else ())))
+        end = offsets[field] + formats[-1].itemsize
+    parts = {
+        "names": list(offsets),
+        "formats": formats,
+        "offsets": list(offsets.values()),
+        "itemsize": -(-end // 16) * 16,
+    }
+    return np.dtype(parts)
+
+
+SURFEL, SEEN, FRAME = _struct("Surfel"), _struct("Seen"), _struct("Frame")
+FIELDS = {**{name: name.removesuffix("s") for name in GEOMETRY}, "mean_residual": "residual", "view_base": "base"}
+"""Fields of `SURFEL` by parameter."""
 
 
 @dataclass
@@ -48,11 +70,10 @@ def arrays(scene: BakedSceneLike) -> Arrays:
     seen = means[means.isfinite().all(1)]
     origin = (seen.amin(0) + seen.amax(0)) / 2 if len(seen) else torch.zeros(3, dtype=torch.float64)
     surfels = np.zeros(n, SURFEL)
-    surfels["mean"] = (means - origin).float().numpy()
-    surfels["opacity_logit"] = p["opacity_logits"].numpy()
-    surfels["quat"] = torch.nn.functional.normalize(p["quats"].double(), dim=1, eps=1e-300).float().numpy()
-    surfels["log_scale"] = p["log_scales"].numpy()
-    surfels["beta_raw"] = p["beta_raw"].numpy()
+    quats = torch.nn.functional.normalize(p["quats"].double(), dim=1, eps=1e-300)
+    stored = {**p, "means": (means - origin).float(), "quats": quats.float()}
+    for name in GEOMETRY:
+        surfels[FIELDS[name]] = stored[name].numpy()
     surfels["extent"] = SUPPORT if scene.extent is None else scene.extent.detach().cpu().numpy()
     if scene.mean_residual is not None:
         surfels["residual"] = scene.mean_residual.detach().cpu().numpy()
@@ -105,10 +126,8 @@ def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, 
 
 def _hide_broken(surfels: npt.NDArray, p: dict[str, Tensor]) -> None:
     """Hide surfels with non-finite numbers or a zero rotation, so that shaders need not test for NaN."""
-    geometry = [p[name].flatten(1) for name in ("means", "quats", "log_scales")]
-    rest = torch.stack([p["opacity_logits"], p["beta_raw"]], dim=1)
-    good = torch.cat([*geometry, rest], dim=1).isfinite().all(1) & (p["quats"].abs().amax(1) > 0)
-    broken = ~good.numpy()
-    for name in ("mean", "quat", "log_scale", "beta_raw"):
-        surfels[name][broken] = 0
+    geometry = torch.cat([p[name][..., None].flatten(1) for name in GEOMETRY], dim=1)
+    broken = ~(geometry.isfinite().all(1) & (p["quats"].abs().amax(1) > 0)).numpy()
+    for name in GEOMETRY:
+        surfels[FIELDS[name]][broken] = 0
     surfels["opacity_logit"][broken] = -100

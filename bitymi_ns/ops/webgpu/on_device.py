@@ -1,7 +1,6 @@
 """Rendering of baked scenes through WebGPU, equal to the kernels': buffers, textures and passes."""
 
 import functools
-import struct
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from torch import Tensor
 from ..baked_cuda import decoded
 from ..baked_scene import BakedSceneLike, check_images, common_size
 from ..project import CameraLike
-from .arrays import arrays
+from .arrays import FRAME, SEEN, arrays
 from .device import check_room, device, in_software, library
 from .programs import Programs
 
@@ -75,8 +74,8 @@ class SceneOnDevice:
         storage, n = flags.STORAGE, max(1, self.count)
         self._surfels = self._upload(packed.surfels, storage)
         self._terms = self._upload(packed.terms, storage)
-        self._frame = self._empty(160, flags.UNIFORM | flags.COPY_DST)
-        self._seen = self._empty(96 * n, storage | flags.COPY_SRC)
+        self._frame = self._empty(FRAME.itemsize, flags.UNIFORM | flags.COPY_DST)
+        self._seen = self._empty(SEEN.itemsize * n, storage | flags.COPY_SRC)
         self._keys = [self._empty(4 * n, storage) for _ in range(2)]
         self._order = [self._empty(4 * n, storage | flags.COPY_SRC) for _ in range(2)]
         self._visible = self._empty(4, storage | flags.COPY_DST | flags.COPY_SRC)
@@ -236,18 +235,17 @@ class SceneOnDevice:
     def _set_frame(self, camera: CameraLike, show: str, layers: int, photo_pixel: float) -> None:
         viewmat, K = camera.viewmat.cpu().double().numpy(), camera.K.cpu().double().numpy()
         center = camera.exact_center.cpu().double().numpy() - self._origin
-        rows = [(*viewmat[k, :3], 0.0) for k in range(3)]
-        data = struct.pack(
-            "<32f5IfI4x",
-            *(value for row in rows for value in row),
-            *(*center, self._alpha_scale, *center, 1.0),
-            *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
-            *(camera.width, camera.height, self._near, self._bound),
-            *(self._offset, self._scale, *self._atlas_size),
-            *(self.count, self._kind, layers),
-            *(SHOW[show], 1, photo_pixel, self._detail),
-        )
-        self._device.queue.write_buffer(self._frame, 0, data)
+        frame = np.zeros(1, FRAME)
+        frame["rotation"][0, :, :3] = viewmat[:3, :3]
+        lens = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        values = {"center": center, "color_center": center, "lens": lens, "size": (camera.width, camera.height)}
+        values |= {"near": self._near, "weight_bound": self._bound, "photo_pixel": photo_pixel, "depth_unit": 1}
+        values |= {"offset": self._offset, "scale": self._scale, "alpha_scale": self._alpha_scale}
+        values |= {"surfels": self.count, "kind": self._kind, "atlas": self._atlas_size, "layers": layers}
+        values |= {"show": SHOW[show], "detail": self._detail, "residuals": 1}
+        for name, value in values.items():
+            frame[name] = value
+        self._device.queue.write_buffer(self._frame, 0, frame)
 
     def draw(self, camera: CameraLike, show: str, layers: int, photo_pixel: float = 1.0) -> npt.NDArray[np.float32]:
         """Draw a view.

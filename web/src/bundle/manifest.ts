@@ -1,18 +1,9 @@
 // The part of bundle.json that the viewer needs; bitymi_ns/bundle/manifest.py has the whole schema.
 import { DamagedBundle, ViewerError } from '../errors';
 import type { Column } from './compact/columns';
+import { EARLIER, EXTENT, FORMAT, LEAN_WIDTH, NEWEST_MAJOR, RANGES } from './tables';
 
-export const FORMAT = 'bitymi-bundle';
-export const NEWEST_MAJOR = 6;
-// Versions that are read as the newest, and the file of surfels that each had.
-const EARLIER: Record<string, string> = {
-  '1.4': 'surfels.ply',
-  '2.3': 'surfels.ply',
-  '4.0': 'surfels.ply',
-  '5.0': 'surfels.bin',
-};
-
-export type ViewKind = 'sv' | 'sh' | 'sb' | 'sg';
+export type ViewKind = keyof typeof LEAN_WIDTH;
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
 export type Vec3 = [number, number, number];
 
@@ -63,10 +54,12 @@ export interface Manifest {
 
 type Json = Record<string, unknown>;
 
+// Reads an object of bundle.json; the ranges of its numbers are those of `name` in RANGES.
 class Reader {
   constructor(
     private readonly value: Json,
-    private readonly path: string,
+    private readonly path = '',
+    private readonly name = '',
   ) {}
 
   private refuse(key: string, what: string): never {
@@ -78,17 +71,17 @@ class Reader {
   part(key: string): Reader {
     const found = this.value[key];
     if (typeof found !== 'object' || found === null || Array.isArray(found)) this.refuse(key, 'an object');
-    return new Reader(found as Json, `${this.path}${key}.`);
+    return new Reader(found as Json, `${this.path}${key}.`, key);
   }
-  number(key: string, low: number, high: number): number {
-    const found = this.value[key];
+  number(key: string): number {
+    const [found, [low, high]] = [this.value[key], RANGES[`${this.name}.${key}`]];
     if (typeof found !== 'number' || !(found >= low && found <= high)) {
       this.refuse(key, `a number from ${low} to ${high}`);
     }
     return found;
   }
-  whole(key: string, low: number, high: number): number {
-    const found = this.number(key, low, high);
+  whole(key: string): number {
+    const found = this.number(key);
     if (!Number.isInteger(found)) this.refuse(key, 'a whole number');
     return found;
   }
@@ -97,9 +90,9 @@ class Reader {
     if (!choices.includes(found as T)) this.refuse(key, `one of ${choices.join(', ')}`);
     return found as T;
   }
-  point(key: string, limit: number): Vec3 {
-    const found = this.value[key];
-    const good = (x: unknown): boolean => typeof x === 'number' && Math.abs(x) <= limit;
+  point(key: string): Vec3 {
+    const [found, [low, high]] = [this.value[key], RANGES[`${this.name}.${key}`]];
+    const good = (x: unknown): boolean => typeof x === 'number' && x >= low && x <= high;
     if (!Array.isArray(found) || found.length !== 3 || !found.every(good)) this.refuse(key, 'three numbers');
     return found as Vec3;
   }
@@ -111,11 +104,11 @@ class Reader {
   parts(key: string, most: number): Reader[] {
     return this.list(key, most).map((part, k) => {
       if (typeof part !== 'object' || part === null) this.refuse(`${key}.${k}`, 'an object');
-      return new Reader(part as Json, `${this.path}${key}.${k}.`);
+      return new Reader(part as Json, `${this.path}${key}.${k}.`, key);
     });
   }
-  wholes(key: string, most: number, low: number, high: number): number[] {
-    const found = this.list(key, most);
+  wholes(key: string, most: number): number[] {
+    const [found, [low, high]] = [this.list(key, most), RANGES[`${this.name}.${key}`]];
     const good = (x: unknown): boolean => Number.isInteger(x) && (x as number) >= low && (x as number) <= high;
     if (!found.every(good)) this.refuse(key, `whole numbers from ${low} to ${high}`);
     return found as number[];
@@ -123,7 +116,7 @@ class Reader {
   entries(most: number): [string, Reader][] {
     const keys = Object.keys(this.value);
     if (keys.length > most) throw new DamagedBundle(`bundle.json: ${this.path} has more than ${most} keys.`);
-    return keys.map((key) => [key, this.part(key)]);
+    return keys.map((key) => [key, new Reader(this.part(key).value, `${this.path}${key}.`, this.name)]);
   }
   text(key: string, pattern: RegExp): string {
     const found = this.value[key];
@@ -132,7 +125,6 @@ class Reader {
   }
 }
 
-const SIDE = 1 << 20;
 const MOST_COLUMNS = 64;
 const MOST_NUMBERS = 16; // per row of a column
 const MOST_POINTS = 4096;
@@ -142,23 +134,23 @@ const RATES = [1e-12, 1e12]; // pixels per unit of length
 function columns(r: Reader): Column[] {
   return r.parts('columns', MOST_COLUMNS).map((column) => ({
     name: column.text('name', /^[a-z0-9_]{1,20}$/),
-    step: column.has('step') ? column.number('step', 1e-12, 1e6) : null,
-    bytes: column.wholes('bytes', MOST_NUMBERS, 0, 2 ** 40),
+    step: column.has('step') ? column.number('step') : null,
+    bytes: column.wholes('bytes', MOST_NUMBERS),
   }));
 }
 
 function compact(r: Reader): CompactSurfels {
   const frame = r.part('frame');
-  const [center, low] = [frame.point('center', 1e9), frame.point('low', 100)];
-  return { frame: { center, scale: frame.number('scale', 1e-300, 1e9), low }, columns: columns(r) };
+  const [center, scale, low] = [frame.point('center'), frame.number('scale'), frame.point('low')];
+  return { frame: { center, scale, low }, columns: columns(r) };
 }
 
 function texels(r: Reader, surfelBytes: number): CodedTexels {
   return {
-    texels: r.whole('texels', 0, 2 ** 50),
-    step: r.number('step', 1e-6, 100),
-    pageWidth: r.whole('page_width', 1, SIDE),
-    pageRows: r.whole('page_rows', 1, SIDE),
+    texels: r.whole('texels'),
+    step: r.number('step'),
+    pageWidth: r.whole('page_width'),
+    pageRows: r.whole('page_rows'),
     columns: columns(r),
     surfelBytes,
   };
@@ -168,13 +160,13 @@ function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
   const format = r.choice('format', isCompact ? ['dct'] : ['bc7', 'uint8', 'fp16']);
   return {
     format,
-    width: r.whole('width', 1, SIDE),
-    height: r.whole('height', 1, SIDE),
-    layers: r.whole('layers', 1, SIDE),
-    extent: r.has('extent') ? r.number('extent', 1e-6, 16) : 3,
-    offset: r.number('offset', -256, 256),
-    scale: r.number('scale', 0, 512),
-    alphaScale: r.has('alpha_scale') ? r.number('alpha_scale', 1e-6, 2) : 0,
+    width: r.whole('width'),
+    height: r.whole('height'),
+    layers: r.whole('layers'),
+    extent: r.has('extent') ? r.number('extent') : EXTENT,
+    offset: r.number('offset'),
+    scale: r.number('scale'),
+    alphaScale: r.has('alpha_scale') ? r.number('alpha_scale') : 0,
     coded: isCompact ? texels(r, surfelBytes) : null,
   };
 }
@@ -208,7 +200,7 @@ export function parseManifest(text: string): Manifest {
   if (typeof json !== 'object' || json === null || (json as Json).format !== FORMAT) {
     throw new ViewerError('This is not a bundle', `bundle.json has not the format ${FORMAT}.`, 'Open another folder.');
   }
-  const root = new Reader(json as Json, '');
+  const root = new Reader(json as Json);
   const version = root.text('version', /^[0-9]{1,6}\.[0-9]{1,6}$/);
   const major = Number(version.split('.')[0]);
   if (major > NEWEST_MAJOR) {
@@ -226,7 +218,7 @@ export function parseManifest(text: string): Manifest {
     root
       .part('files')
       .entries(MOST_FILES)
-      .map(([name, r]) => [name, { bytes: r.whole('bytes', 0, 2 ** 36), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
+      .map(([name, r]) => [name, { bytes: r.whole('bytes'), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
   );
   const isCompact = files.has('surfels.bin');
   if (major < NEWEST_MAJOR && EARLIER[version] !== (isCompact ? 'surfels.bin' : 'surfels.ply')) {
@@ -240,18 +232,18 @@ export function parseManifest(text: string): Manifest {
   if (render.has('prefilter')) render.choice('prefilter', ['low_pass']); // others are drawn no longer
   return {
     version,
-    count: surfels.whole('count', 0, 2 ** 28),
-    viewColor: surfels.choice('view_color', ['sv', 'sh', 'sb', 'sg']),
-    terms: surfels.has('terms') || isCompact ? surfels.whole('terms', 0, 2 ** 31) : null,
+    count: surfels.whole('count'),
+    viewColor: surfels.choice('view_color', Object.keys(LEAN_WIDTH) as ViewKind[]),
+    terms: surfels.has('terms') || isCompact ? surfels.whole('terms') : null,
     compact: isCompact ? compact(surfels) : null,
     atlas: texture,
-    near: render.number('near', 1e-9, 1e6),
-    weightBound: render.number('weight_bound', 0, 1),
+    near: render.number('near'),
+    weightBound: render.number('weight_bound'),
     photographed: render.has('photographed') ? points(render) : null,
-    background: render.point('background', 1),
-    bounds: { min: bounds.point('min', 1e9), max: bounds.point('max', 1e9) },
-    up: world?.has('up') ? world.point('up', 2) : null,
-    metres: world?.has('metres_per_unit') ? world.number('metres_per_unit', 1e-300, 1e12) : null,
+    background: render.point('background'),
+    bounds: { min: bounds.point('min'), max: bounds.point('max') },
+    up: world?.has('up') ? world.point('up') : null,
+    metres: world?.has('metres_per_unit') ? world.number('metres_per_unit') : null,
     files,
   };
 }

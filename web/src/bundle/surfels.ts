@@ -3,11 +3,13 @@ import { DamagedBundle } from '../errors';
 import type { Manifest, Vec3, ViewKind } from './manifest';
 import { Table, parsePly } from './ply';
 import {
+  EXTENT,
   EXTENTS,
   KINDS,
   LEAN_WIDTH,
   LIMITS,
   MAX_TERMS,
+  PLY,
   SURFEL_WORDS,
   TERM_LIMITS,
   UNIT_SLACK,
@@ -156,12 +158,8 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const rows = new Table(data, vertex, 'vertex');
   const words = new Float32Array(rows.count * SURFEL_WORDS);
   const copy = (column: string, at: number): void => rows.into(column, words, at, SURFEL_WORDS);
-  ['x', 'y', 'z'].forEach((name, c) => copy(name, WORD.mean + c));
-  [0, 1, 2, 3].forEach((c) => copy(`rot_${c}`, WORD.quat + c));
-  [0, 1].forEach((c) => copy(`scale_${c}`, WORD.logScale + c));
-  copy('opacity', WORD.opacityLogit);
-  copy('beta', WORD.betaRaw);
-  const extent = info.atlas?.extent ?? 3;
+  for (const [column, at] of Object.entries(PLY)) copy(column, at);
+  const extent = info.atlas?.extent ?? EXTENT;
   if (rows.has('tile_extent')) copy('tile_extent', WORD.extent);
   else for (let at = WORD.extent; at < words.length; at += SURFEL_WORDS) words[at] = extent;
   const means = rows.has('residual_0');

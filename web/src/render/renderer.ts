@@ -1,10 +1,11 @@
 // Draws frames of a scene to a target of sums, and from there to a screen.
 import type { Vec3 } from '../bundle/manifest';
+import { FRAME, FRAME_BYTES } from '../bundle/tables';
 import type { View } from '../view/pose';
 import { type Part, type Sampling, isFar, partOf, samplingOf, sizeOf } from '../view/size';
 import type { Graphics } from './device';
 import { type Programs, SHOW, type Show, type TargetFormat } from './programs';
-import { FRAME_BYTES, type SceneOnDevice, STRIDE, group } from './scene';
+import { type SceneOnDevice, STRIDE, group } from './scene';
 
 export interface DrawOptions {
   show: Show;
@@ -112,16 +113,17 @@ export class Renderer {
     const data = new ArrayBuffer(FRAME_BYTES);
     const [f, u] = [new Float32Array(data), new Uint32Array(data)];
     const { right, down, forward } = view.pose;
-    [right, down, forward].forEach((row, k) => f.set(row, 4 * k));
+    [right, down, forward].forEach((row, k) => f.set(row, FRAME.rotation + 4 * k));
     const relative = (at: Vec3): number[] => at.map((x, c) => x - surfels.origin[c]);
-    f.set([...relative(view.pose.position), alphaScale], 12);
-    f.set([...relative(options.held ?? view.pose.position), options.farthest], 16);
-    f.set([view.fx, view.fy, view.cx, view.cy], 20);
-    f.set([width, height, info.near, info.weightBound], 24);
-    f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], 28);
-    u.set([count, surfels.kind, options.layers, SHOW[options.show], options.residuals ? 1 : 0], 32);
-    f[37] = photoPixel;
-    u[38] = this.scene.detail;
+    const { position } = view.pose;
+    f.set([...relative(position), alphaScale], FRAME.center);
+    f.set([...relative(options.held ?? position), options.farthest], FRAME.colorCenter);
+    f.set([view.fx, view.fy, view.cx, view.cy], FRAME.lens);
+    f.set([width, height, info.near, info.weightBound], FRAME.size);
+    f.set([info.atlas?.offset ?? 0, info.atlas?.scale ?? 1, ...atlasSize], FRAME.offset);
+    u.set([count, surfels.kind, options.layers, SHOW[options.show], options.residuals ? 1 : 0], FRAME.surfels);
+    f[FRAME.photoPixel] = photoPixel;
+    u[FRAME.detail] = this.scene.detail;
     this.graphics.device.queue.writeBuffer(this.scene.frame, 0, data);
   }
 

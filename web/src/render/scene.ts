@@ -3,18 +3,13 @@ import { decodeBc7 } from '../bundle/bc7';
 import { type Pages, blockOf } from '../bundle/ktx2';
 import type { Manifest } from '../bundle/manifest';
 import { type Surfels } from '../bundle/surfels';
-import { SURFEL_WORDS, WORD } from '../bundle/tables';
+import { BLOCK, DIGITS, FRAME_BYTES, MOST_LAYERS, ROUNDS, SEEN_BYTES, SURFEL_WORDS, WORD } from '../bundle/tables';
 import { tooLarge } from '../errors';
 import type { Graphics } from './device';
 import { GROUP } from './limits';
 import { type Programs, SORT_ENTRIES, type SortEntry } from './programs';
 
-export const MOST_LAYERS = 64;
 export const STRIDE = 256; // offset alignment of the batches' uniforms
-const BLOCK = 1024; // of sort.wgsl: keys per block, digits, rounds
-const DIGITS = 16;
-const ROUNDS = 8;
-export const FRAME_BYTES = 160;
 const NO_OPACITY = -1e4; // logit
 
 type Resource = GPUBuffer | GPUTextureView | GPUSampler;
@@ -62,7 +57,7 @@ export class SceneOnDevice {
     const n = Math.max(1, this.count);
     const stored = (this.stored = this.upload(surfels.words, STORAGE));
     const terms = this.upload(surfels.terms, STORAGE);
-    const seen = this.empty(96 * n, STORAGE);
+    const seen = this.empty(SEEN_BYTES * n, STORAGE);
     const keys = [0, 1].map(() => this.empty(4 * n, STORAGE));
     const order = [0, 1].map(() => this.empty(4 * n, STORAGE));
     const table = this.empty(4 * DIGITS * this.blocks, STORAGE);

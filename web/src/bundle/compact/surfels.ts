@@ -2,15 +2,24 @@
 import { DamagedBundle } from '../../errors';
 import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
 import { type Surfels, alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
-import { ALPHA_MIN, COLOR_LIMIT, EXTENT, EXTENTS, KINDS, LEAN_WIDTH, LIMITS, MAX_TERMS } from '../tables';
-import { POSITION_BITS, SHAPES, SMALLEST_SHARE, SURFEL_WORDS, WORD } from '../tables';
+import {
+  COLOR_LIMIT,
+  COLUMNS,
+  EXTENT,
+  EXTENTS,
+  KINDS,
+  LEAN_COUNTS,
+  LEAN_WIDTH,
+  LIMITS,
+  LINEAR,
+  MAX_TERMS,
+} from '../tables';
+import { MOST_EXPONENT, POSITION_BITS, SHAPES, SMALLEST_SHARE, SPARE_SURFELS, STEPPED } from '../tables';
+import { SURFELS_PER_BYTE, SURFEL_WORDS, WORD } from '../tables';
 import { ColumnReader, checkColumns } from './columns';
 import { pack } from './packing';
 
-export const SURFELS_PER_BYTE = 1; // most that a file may state, beyond SPARE_SURFELS
-export const SPARE_SURFELS = 1 << 12;
 const LEAST_EXPONENT = 2; // log2 of a tile side
-const MOST_EXPONENT = 12;
 const BENT = 50; // largest argument of sinh: beyond all limits
 const FILE = 'surfels.bin';
 
@@ -24,24 +33,12 @@ const sinh = (x: number): number => Math.sinh(within(x, BENT));
 
 function expected(kind: ViewKind, alpha: boolean): [string, number][] {
   const shapes = SHAPES[kind].limits.length;
-  return [
-    ['place', 1],
-    ['largest', 1],
-    ['rotation', 3],
-    ['log_scales', 2],
-    ['opacity', 1],
-    ['beta', 1],
-    ['size', 1],
-    ['residual', 3],
-    ...(alpha ? [['alpha', 1] as [string, number]] : []),
-    ['view_base', 3],
-    ['extent', 1],
-    ['view_count', 1],
+  const terms: [string, number][] = [
     ['term_shape', shapes],
     ['term_color', LEAN_WIDTH[kind] - shapes],
   ];
+  return [...Object.entries(COLUMNS).filter(([name]) => alpha || name !== 'alpha'), ...terms];
 }
-const STEPPED = ['place', 'rotation', 'log_scales', 'opacity', 'beta', 'residual', 'view_base', 'extent', 'term_shape'];
 
 // Extracts every third bit of a number below 2^27, from the lowest.
 function thirds(key: number): number {
@@ -81,7 +78,7 @@ class Decoder {
       throw new DamagedBundle(`${FILE}: ${this.count} surfels cannot be in ${data.length} bytes.`);
     }
     for (const { name, step } of columns) {
-      if (step === null && (STEPPED.includes(name) || name === 'term_color')) this.refuse(`${name} has no step`);
+      if (step === null && STEPPED.includes(name)) this.refuse(`${name} has no step`);
     }
     const reader = new ColumnReader(data, columns, FILE);
     for (let name = reader.name; name !== undefined; name = reader.name) {
@@ -141,20 +138,20 @@ class Decoder {
     }
   }
 
-  private shapes(): void {
-    const of = ['log_scales', 'opacity', 'beta', 'residual', 'view_base'].map((name) => this.step(name));
-    const [ofScale, ofOpacity, ofBeta, ofResidual, ofBase] = of;
-    const [scales, [opacity], [beta]] = ['log_scales', 'opacity', 'beta'].map((name) => this.column(name));
-    const [residual, base] = [this.column('residual'), this.column('view_base')];
-    for (let i = 0, to = 0; i < this.count; i++, to += SURFEL_WORDS) {
-      for (let c = 0; c < 2; c++) {
-        this.words[to + WORD.logScale + c] = within(ofScale * scales[c][i], LIMITS.log_scales[2]);
-      }
-      this.words[to + WORD.opacityLogit] = logit(ofOpacity * opacity[i], ALPHA_MIN);
-      this.words[to + WORD.betaRaw] = logit(ofBeta * beta[i], SMALLEST_SHARE);
-      color(this.words, to + WORD.residual, residual, 0, i, ofResidual);
-      color(this.words, to + WORD.base, base, 0, i, ofBase);
+  private linear(): void {
+    for (const [name, { at, limit, least }] of Object.entries(LINEAR)) {
+      const step = this.step(name);
+      this.column(name).forEach((codes, c) => {
+        for (let i = 0, to = at + c; i < this.count; i++, to += SURFEL_WORDS) {
+          this.words[to] = least === null ? within(step * codes[i], limit) : logit(step * codes[i], least);
+        }
+      });
     }
+  }
+
+  private colors(name: string, at: number): void {
+    const [codes, step] = [this.column(name), this.step(name)];
+    for (let i = 0; i < this.count; i++) color(this.words, at + i * SURFEL_WORDS, codes, 0, i, step);
   }
 
   private tiles(): void {
@@ -196,9 +193,8 @@ class Decoder {
   private viewColors(): Float32Array {
     const kind = this.info.viewColor;
     const [[counts], shape, colors] = ['view_count', 'term_shape', 'term_color'].map((name) => this.column(name));
-    const good = kind === 'sh' ? [0, 3, 8, 15] : Array.from({ length: MAX_TERMS + 1 }, (_, k) => k);
-    const width = LEAN_WIDTH[kind];
-    if (!counts.every((count) => good.includes(count))) {
+    const [allowed, width] = [LEAN_COUNTS[kind], LEAN_WIDTH[kind]];
+    if (!counts.every((count) => (allowed ? allowed.includes(count) : count >= 0 && count <= MAX_TERMS))) {
       this.refuse('a view colour has a number of terms that none can have');
     }
     if (setTerms(this.words, counts, width) !== this.terms) {
@@ -218,7 +214,9 @@ class Decoder {
   surfels(): Surfels {
     this.positions();
     this.rotations();
-    this.shapes();
+    this.linear();
+    this.colors('residual', WORD.residual);
+    this.colors('view_base', WORD.base);
     this.tiles();
     if (this.alpha) this.alphas();
     const terms = this.viewColors();

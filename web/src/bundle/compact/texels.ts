@@ -3,15 +3,11 @@ import { DamagedBundle } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, CodedTexels } from '../manifest';
 import { type Surfels, alphaIn, layerIn } from '../surfels';
-import { SURFEL_WORDS, WORD } from '../tables';
+import { GRADES, MOST_COEFFICIENT, SPARE_TEXELS, SURFEL_WORDS, TEXELS_PER_BYTE, WORD } from '../tables';
 import { ColumnReader, checkColumns } from './columns';
 
-export const TEXELS_PER_BYTE = 64; // of both files: most that they may state, beyond SPARE_TEXELS
-export const SPARE_TEXELS = 1 << 20;
 const MOST_TEXELS = 2 ** 30; // in all pages: four gigabytes
 const BLOCK = 8;
-const GRADES: [number, number] = [-8, 24];
-const MOST_COEFFICIENT = 2 ** 24;
 const FILE = 'texels.bin';
 
 // Tiles in surfel order.

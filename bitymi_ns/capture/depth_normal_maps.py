@@ -22,7 +22,6 @@ from bitymi_ns.ranges import spread
 from bitymi_ns.safe_reading import open_regular
 
 MILLIMETER = 1e-3  # metres per unit of integer depth unless stated: nerfstudio's convention
-MAPS = "maps"  # metadata key of the views' `MapFiles`
 COLOR_SAMPLES = 8  # files of a folder of depth that are tested; if all are color pictures, it is not used
 MOST_LARGER = 8  # largest ratio of a map's side to its photograph's, which may be a reduced copy
 MOST_NUMBERS = 1 << 28  # most numbers of a map: 80 million normals, or 260 million depths

@@ -134,6 +134,7 @@ class Capture:
     downscale: int = 1  # factor by which photographs are reduced
     applied: Pose | None = None  # transform [4, 4] that its files state as applied, with a scale
     applied_scale: float = 1.0
+    declares_box: bool = False  # its files state the box of the scene
     poses_as: str = AUTO  # name of the reading of its poses
     report: Path | None = None  # folder of the report on structure from motion; None = none
     model: Source | None = None  # found by structure from motion; None = the capture came with poses
@@ -203,7 +204,7 @@ class _Reader:
         read, source = self._read_transforms(found.path), str(found.path)
         meta, frame = read.meta, options
         earlier = found.folder / "colmap/sparse/0"  # points of nerfstudio's tool before it stated either
-        applied, own = meta.get("applied_transform"), None
+        applied, own, boxed = meta.get("applied_transform"), None, False
         if applied is None and earlier.is_dir():
             applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
         what, auto = f"{source} ({found.format}, {len(read.photographs)} photographs)", options.points == "auto"
@@ -216,7 +217,7 @@ class _Reader:
             if not 0.0 < half < math.inf:
                 fail(f"{read.path}: aabb_scale is {meta['aabb_scale']}, which is no positive number. Correct it.")
             frame = FrameOptions(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
-            frame = fit_scale(frame, photographs, source)
+            frame, boxed = fit_scale(frame, photographs, source), "aabb_scale" in meta
         elif "orientation_override" in meta:
             if meta["orientation_override"] not in get_args(Orientation):
                 allowed = ", ".join(get_args(Orientation))
@@ -231,7 +232,9 @@ class _Reader:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
         scale = float(meta.get("applied_scale", 1.0))
         points = self._points(own, photographs, source)
-        return Capture(found.format, source, photographs, points, frame, read.lists, {}, self.downscale, applied, scale)
+        return Capture(
+            found.format, source, photographs, points, frame, read.lists, {}, self.downscale, applied, scale, boxed
+        )
 
     def _colmap(self) -> Capture:
         """Read a COLMAP model, and the lists of names beside it."""

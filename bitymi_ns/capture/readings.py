@@ -16,7 +16,6 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.cache import content_key
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, read_image
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.order import natural
@@ -256,9 +255,6 @@ def decide(photographs: Sequence[Photograph], poses: Array, written: Reading) ->
     return Decision(None, share, as_written, most, tuple(worst[:3]))
 
 
-_decided: dict[str, Decision] = {}  # commands read a capture twice: to check it first, and to use it
-
-
 def as_meant(
     photographs: Sequence[Photograph], written: Reading, frame: Array, source: str, asked: str
 ) -> tuple[list[Photograph], Array, str]:
@@ -269,9 +265,7 @@ def as_meant(
     named = {WRITTEN: written} | {each.name: each for each in readings(written)}
     poses, decision = np.linalg.inv(frame) @ np.stack([each.pose for each in photographs]), Decision(named.get(asked))
     if asked == AUTO:
-        files = [(each.file.name, each.file) for each in photographs]
-        key = content_key(files, [(each.camera, each.pose.tolist(), str(each.mask)) for each in photographs])
-        decision = _decided[key] = _decided.get(key) or decide(photographs, poses, written)
+        decision = decide(photographs, poses, written)
     elif decision.reading is None:
         some = [each.name for each in named.values() if not each.turn and not each.intrinsics]
         fail(f"--poses-as is {asked}, but {source} can be read as {AUTO}, {WRITTEN}, or as {', '.join(some[1:])}.")

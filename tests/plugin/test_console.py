@@ -2,7 +2,9 @@
 
 import io
 import re
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +14,7 @@ import yaml
 from nerfstudio.scripts import train as ns_train
 from rich.console import Console
 
+from bitymi_ns.capture import read as capture_read
 from bitymi_ns.plugin import console
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import callbacks
@@ -50,6 +53,24 @@ def test_a_run_without_a_terminal_prints_what_it_is_and_a_line_a_report(
     assert "\r" not in printed and "\x1b" not in printed
     saved = yaml.load((tmp_path / "outputs/room/bitymi/run/config.yml").read_text(), Loader=yaml.Loader)
     assert saved.pipeline.model.train.densify.interval == 500 and saved.optimizers  # it is all there
+
+
+def test_a_training_reads_its_capture_once(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    calls = {"read_transforms": 0, "as_meant": 0}
+
+    def count(name: str, function: Any, *given: Any) -> Any:
+        calls[name] += 1
+        return function(*given)
+
+    for name in calls:
+        monkeypatch.setattr(capture_read, name, partial(count, name, getattr(capture_read, name)))
+    config = run_on(capture, tmp_path / "outputs")
+    ns_train.main(config)
+    assert set(calls.values()) == {1} and capsys.readouterr().out.count("Reading ") == 1
+    config.pipeline.datamanager.setup(device="cpu", test_mode="val")  # another data manager reads it as it is by then
+    assert set(calls.values()) == {2}
 
 
 def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatch) -> None:

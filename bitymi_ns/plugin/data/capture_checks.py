@@ -14,12 +14,10 @@ from nerfstudio.data.dataparsers.instant_ngp_dataparser import InstantNGPDataPar
 from nerfstudio.data.dataparsers.minimal_dataparser import MinimalDataParserConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.data.dataparsers.sdfstudio_dataparser import SDFStudioDataParserConfig
-from nerfstudio.utils.rich_utils import CONSOLE
 from PIL import Image, UnidentifiedImageError
 
-from bitymi_ns.capture.colmap_model import forget_model
 from bitymi_ns.capture.image_files import MAX_PIXELS
-from bitymi_ns.capture.read import check_options
+from bitymi_ns.capture.read import Capture, check_options
 from bitymi_ns.capture.recognise import Format
 from bitymi_ns.capture.transforms import HOW_TO_GET_ONE
 from bitymi_ns.capture.types import CaptureError
@@ -64,19 +62,10 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 
 @as_input_error()
-def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains: bool = True) -> str | None:
-    """Check that there is a capture at the data manager's path, and replace its parser by that of `bitymi_parser`.
-
-    Args:
-        read: also read the views, silently, if the capture comes with poses.
-        trains: the command has an option for the path, --data.
-
-    Returns:
-        how the capture's poses are read, if they were.
-
-    Raises:
-        InputError: there is none, or an option is out of range.
-    """
+def check_capture(config: FullImageDatamanagerConfig, trains: bool = True) -> None:
+    """Check that there is a capture at the data manager's path, and make its parser that of `bitymi_parser`, ready to
+    read. `trains`: with points to start from; and the command has an option for the path, --data. Raises InputError:
+    there is none, or an option is out of range."""
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
@@ -85,28 +74,26 @@ def check_capture(config: FullImageDatamanagerConfig, read: bool = False, trains
     check_options(dataparser, lambda name: f"--{name.replace('_', '-')}")
     if isinstance(dataparser, BitymiDataParserConfig):
         dataparser.data = data
-        if read and dataparser.find().format not in ("photographs", "video"):
-            quiet, CONSOLE.quiet = CONSOLE.quiet, True
-            try:
-                with reporting_input_errors(config):
-                    parser = dataparser.setup()
-                    parser.get_dataparser_outputs("train")
-                    return str(parser.poses_as)
-            finally:
-                CONSOLE.quiet = quiet
-                forget_model()
-    return None
+        dataparser.prepare(points=trains)
+
+
+@as_input_error()
+def read_early(config: FullImageDatamanagerConfig) -> Capture | None:
+    """Read the views of a checked capture for a training, if it comes with poses, which takes little time; else None.
+    Raises InputError: it cannot be used."""
+    dataparser = config.dataparser
+    if not isinstance(dataparser, BitymiDataParserConfig) or dataparser.find().format in ("photographs", "video"):
+        return None
+    with reporting_input_errors(config):
+        parser = dataparser.prepare(points=True)
+        _ = parser.outputs
+    return parser.capture
 
 
 def declares_box(dataparser: DataParserConfig) -> bool:
-    """Test if the capture states the box of its scene; other parsers' boxes are defaults."""
-    path = None
-    if isinstance(dataparser, BitymiDataParserConfig):
-        found = dataparser.find()
-        path = found.path if found.format == "instant-ngp" else None
-    elif isinstance(dataparser, InstantNGPDataParserConfig):
+    """Test if a capture that nerfstudio's parser reads states the box of its scene; other parsers' are defaults."""
+    if isinstance(dataparser, InstantNGPDataParserConfig):
         path = dataparser.data if dataparser.data.suffix == ".json" else dataparser.data / "transforms.json"
-    if path is not None:
         return "aabb_scale" in read_json(path)
     return isinstance(dataparser, (MinimalDataParserConfig, SDFStudioDataParserConfig))
 

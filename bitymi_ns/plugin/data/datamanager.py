@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Literal
@@ -24,13 +24,13 @@ from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, warn
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.plugin.data.cameras import check_cameras, to_camera, to_cameras
 from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig, BundleCamerasConfig, reading_points
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig, BundleCamerasConfig
 from bitymi_ns.plugin.data.dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
 from bitymi_ns.plugin.data.depth import with_depth
-from bitymi_ns.plugin.data.views import LONGEST_SIDE, NO_PHOTOS, limit_size, with_lenses
+from bitymi_ns.plugin.data.facts import KEY, CaptureFacts
+from bitymi_ns.plugin.data.views import LONGEST_SIDE, limit_size, with_lenses
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.background_points import background_points
 from bitymi_ns.train.exposure import restored
 from bitymi_ns.train.poses import carried, cross_matrix
 from bitymi_ns.train.processes import Processes
@@ -92,34 +92,32 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         image_files.set_up_pillow()
         check_capture(config, trains=test_mode == "val")
-        with reporting_input_errors(config), reading_points(test_mode == "val"):
+        with reporting_input_errors(config):
             super().__init__(config, test_mode=test_mode, **kwargs)
         self._check_images(test_mode)
         if test_mode == "val":
             self._check_points()
         outputs, dataset = self.train_dataparser_outputs, self.train_dataset
-        cameras, color, files = outputs.cameras, outputs.alpha_color, dataset.files
-        dataset.metadata |= {
-            "alpha_color": None if color is None else torch.as_tensor(color).float(),
-            "has_alpha": bool(files) and image_files.file_has_transparency(files[0]),
-            # decides the background `auto`; photographs may be missing unless a run trains
-            "transparent": self._has_photos(test_mode)
+        cameras, color, files = outputs.cameras, outputs.alpha_color, dataset.facts.files
+        dataset.metadata[KEY] = replace(
+            dataset.facts,
+            alpha_color=None if color is None else torch.as_tensor(color).float(),
+            has_alpha=bool(files) and image_files.file_has_transparency(files[0]),
+            # photographs may be missing unless a run trains
+            transparent=self._has_photos(test_mode)
             and any(
                 image_files.file_has_transparency(files[i]) and dataset.get_numpy_image(i).shape[-1] == 4
                 for i in spread(len(files), ALPHA_SAMPLES)
             ),
-            "declares_box": declares_box(config.dataparser),
-            "train_pixels": int((cameras.width.long() * cameras.height.long()).sum()),
-            "camera_centers": cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3),
-        }
-        points = outputs.metadata.get("points3D_xyz")
-        if test_mode == "val" and points is not None and len(points):
-            # called if a scene starts with these points: it reads the photographs
-            found = partial(background_points, points, self.train_views, config.train_cameras_sampling_seed)
-            dataset.metadata["background_points"] = found
+            declares_box=dataset.facts.declares_box or declares_box(config.dataparser),
+            train_pixels=int((cameras.width.long() * cameras.height.long()).sum()),
+            camera_centers=cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3),
+            background_views=self.train_views if test_mode == "val" else (),
+            seed=config.train_cameras_sampling_seed,
+        )
 
     def _has_photos(self, test_mode: str) -> bool:
-        return test_mode != "inference" and NO_PHOTOS not in self.train_dataparser_outputs.metadata
+        return test_mode != "inference" and not CaptureFacts.of(self.train_dataparser_outputs.metadata).lost
 
     def get_datapath(self) -> Path:
         """Return the viewer's folder of camera paths: the capture's, or the bundle's if that is gone."""
@@ -146,7 +144,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         count, datasets = len(self.train_dataset), (self.train_dataset, self.eval_dataset)
         train, held_out = (dataset.image_filenames for dataset in datasets)
         names = [*train, *held_out]
-        files = [dataset.files for dataset in datasets]
+        files = [dataset.facts.files for dataset in datasets]
         check_cameras([dataset.cameras for dataset in datasets], names)
         poses = torch.cat([dataset.cameras.camera_to_worlds for dataset in datasets]).double().numpy()
         warn_of_mirrored(poses[:, :, :3], names)
@@ -272,9 +270,9 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def corrections(self, state: Mapping[str, Any] | None) -> list[list[Tensor | None]]:
         """Return the colour corrections of the training and of the held-out views (`Exposure.at`), by the state of a
         run's `Exposure`."""
-        files = self.train_dataset.files
-        exposure = restored(state, len(files), files)
-        return [[exposure.at(file) for file in dataset.files] for dataset in (self.train_dataset, self.eval_dataset)]
+        train, held_out = self.train_dataset.facts.files, self.eval_dataset.facts.files
+        exposure = restored(state, len(train), train)
+        return [[exposure.at(file) for file in files] for files in (train, held_out)]
 
     def corrected_eval_views(self, state: Mapping[str, Any] | None) -> OnDemand[View]:
         """Return the held-out views with their colour corrections, by the state of a run's `Exposure`."""
@@ -289,7 +287,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
                 cameras[index] = to_camera(dataset.cameras[index : index + 1], self.device)
             pictures = batch(index)
             maps = {name: pictures.get(name) for name in ("mask", "depth", "normal")}
-            return View(cameras[index], pictures["image"], **maps, file=dataset.files[index])
+            return View(cameras[index], pictures["image"], **maps, file=dataset.facts.files[index])
 
         return OnDemand(len(dataset), view)
 

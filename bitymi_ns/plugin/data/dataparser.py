@@ -1,9 +1,6 @@
 """Parsers: `bitymi-data`, the methods' default, reads a folder or file of any format and splits its views by one rule;
 cameras of a bundle serve where the capture is gone."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,28 +16,15 @@ from bitymi_ns.bundle import BundleError
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.bundle.read import read_cameras, read_manifest
 from bitymi_ns.capture import splits
-from bitymi_ns.capture.colmap_views import Source
 from bitymi_ns.capture.lens import Pinhole
-from bitymi_ns.capture.read import CaptureOptions, read_capture
+from bitymi_ns.capture.read import Capture, CaptureOptions, read_capture
 from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.types import OPENCV_AXES
 from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.depth import DepthKind
-from bitymi_ns.plugin.data.views import NO_PHOTOS, Views, make_views, pinhole_cameras, select_views
+from bitymi_ns.plugin.data.facts import KEY, CaptureFacts
+from bitymi_ns.plugin.data.views import Views, make_views, pinhole_cameras
 from bitymi_ns.trust import inside
-
-_want_points: ContextVar[bool] = ContextVar("want_points", default=False)
-
-
-@contextmanager
-def reading_points(wanted: bool) -> Iterator[None]:
-    """Have captures read with their points if `wanted`, for a scene that starts from them; evaluation and the viewer
-    skip them."""
-    token = _want_points.set(wanted)
-    try:
-        yield
-    finally:
-        _want_points.reset(token)
 
 
 @dataclass
@@ -58,6 +42,23 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
     """Metres per unit of depth; None = 0.001 for integers, 1 for floating-point numbers."""
     poses: tyro.conf.Suppress[Path | None] = None
     """Folder of the poses that a run was trained with; set where its data are read."""
+    _parser: "BitymiDataParser | None" = field(default=None, init=False, repr=False, compare=False)
+
+    def prepare(self, points: bool) -> "BitymiDataParser":
+        """Make the parser that the next `setup` returns, unless there is one: nerfstudio calls that without arguments,
+        and a training reads its capture once, before its first file is written. `points`: read the points, too, for a
+        scene that starts from them; evaluation and the viewer skip them."""
+        if self._parser is None or self._parser.points != points:
+            self._parser = BitymiDataParser(self, points)
+        return self._parser
+
+    def setup(self, **kwargs: Any) -> "BitymiDataParser":
+        parser, self._parser = self._parser or BitymiDataParser(self), None
+        return parser
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the options, for config.yml, copies and other processes."""
+        return {name: value for name, value in vars(self).items() if name != "_parser"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Load a config.yml; one without poses_as is of a run that took the poses as written."""
@@ -74,27 +75,23 @@ class BitymiDataParser(DataParser):
 
     config: BitymiDataParserConfig
 
-    def __init__(self, config: BitymiDataParserConfig) -> None:
+    def __init__(self, config: BitymiDataParserConfig, points: bool = False) -> None:
         super().__init__(config)
+        self.points = points
         self.downscale_factor: int | None = None  # set by nerfstudio if photographs are not needed: none is opened then
-        # after reading: report on structure from motion, and its model; None = the capture came with poses
-        self.poses_report: Path | None = None
-        self.sfm_source: Source | None = None
-        self.poses_as = config.poses_as  # after reading: how the poses were read
+
+    @cached_property
+    @as_input_error()
+    def capture(self) -> Capture:
+        """The capture; read once."""
+        return read_capture(self.config, self.downscale_factor is None, self.points)
 
     @cached_property
     @as_input_error()
     def outputs(self) -> dict[str, DataparserOutputs]:
-        """Outputs by split: train, val, test; read once."""
-        need_photos, color = self.downscale_factor is None, self.config.alpha_color
-        capture = read_capture(self.config, need_photos, _want_points.get())
-        self.poses_report, self.sfm_source, self.poses_as = capture.report, capture.model, capture.poses_as
-        views = make_views(capture, need_photos)
-        if capture.format == "blender" and color is not None:
-            views.alpha_color = get_color(color)
-        of = views.metadata["photographs"]
-        parts = {name: set(part) for name, part in capture.parts.items()}
-        return {name: select_views(views, [i for i, n in enumerate(of) if n in part]) for name, part in parts.items()}
+        """Outputs by split: train, val, test."""
+        color = self.config.alpha_color if self.capture.format == "blender" else None
+        return make_views(self.capture, self.downscale_factor is None, None if color is None else get_color(color))
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         return self.outputs[split]
@@ -126,17 +123,17 @@ class BundleCameras(DataParser):
         except ValueError as error:
             fail(f"{folder}, {CAMERAS}: {error}.", error)
         chosen = [row for row in rows if row.held_out == (split != "train")] or rows
-        poses, pinholes = [], []
+        names, poses, pinholes = [files[row.name] for row in chosen], [], []
         for camera in (row.camera for row in chosen):
             poses.append((torch.linalg.inv(camera.viewmat.double()) @ torch.from_numpy(OPENCV_AXES)).float())
             K = camera.K.tolist()
             pinholes.append(Pinhole(K[0][0], K[1][1], K[0][2], K[1][2], camera.width, camera.height))
         return Views(
-            image_filenames=[files[row.name] for row in chosen],
+            image_filenames=names,
             cameras=pinhole_cameras(pinholes, torch.stack(poses)),
             dataparser_scale=float(info.world.scale),
             dataparser_transform=torch.tensor(np.asarray(info.world.transform, np.float64)[:3]),
-            metadata={NO_PHOTOS: self.config.gray},
+            metadata={KEY: CaptureFacts(files=names, lost=True, gray=self.config.gray)},
         )
 
 

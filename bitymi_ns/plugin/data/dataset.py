@@ -4,7 +4,6 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -19,12 +18,11 @@ from torch import Tensor
 
 from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.capture.image_files import ImageSummary, in_threads, pixels_of, read_image, summarize, wrong_size
-from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
-from bitymi_ns.plugin.data.depth import FITTED
-from bitymi_ns.plugin.data.views import MOVED, NO_PHOTOS, photograph_files, select_views
+from bitymi_ns.plugin.data.facts import CaptureFacts
+from bitymi_ns.plugin.data.views import MOVED, select_views
 from bitymi_ns.train.views import MemoryBudget, over_background, resample_nearest
 
 PHOTOGRAPH_BYTES = 1 << 28
@@ -44,25 +42,25 @@ class BitymiDataset(InputDataset):
         super().__init__(dataparser_outputs, scale_factor)
         self._summaries: dict[int, ImageSummary] = {}
         # show missing photographs grey, where they are not asked for; else fail
-        self.gray_images = bool(dataparser_outputs.metadata.get(NO_PHOTOS))
+        self.gray_images = self.facts.gray
         self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # views of one photograph follow each other
 
     @property
-    def files(self) -> list[Path]:
-        """Photograph of each view."""
-        return photograph_files(self._dataparser_outputs)
+    def facts(self) -> CaptureFacts:
+        """Facts of the capture and of each view."""
+        return CaptureFacts.of(self.metadata)
 
     @as_input_error()
     def get_numpy_image(self, image_idx: int) -> npt.NDArray[np.uint8]:
         """Read an undistorted image [H, W, 3 or 4]."""
-        path = self.files[image_idx]
+        path = self.facts.files[image_idx]
         camera = self.cameras[image_idx].reshape(())
         declared = (int(camera.width), int(camera.height))
-        if NO_PHOTOS in self._dataparser_outputs.metadata:
+        if self.facts.lost:
             if not self.gray_images:
                 fail(f"the photograph {path} is needed, and the capture is gone. {MOVED}")
             return np.full((*declared[::-1], 3), 128, np.uint8)
-        lens = self._lens(image_idx)
+        lens = self.facts.lenses[image_idx]
         read = self._read_shared if lens.face else read_image
         image = lens.undistort(read(path, lens.stored, lens.camera.size))
         image = self._scaled(image, Image.Resampling.BILINEAR)
@@ -100,7 +98,7 @@ class BitymiDataset(InputDataset):
         read = self.get_image_float32 if image_type == "float32" else self.get_image_uint8
         data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
         masks = self._dataparser_outputs.mask_filenames
-        if masks is not None or not self._whole(image_idx):
+        if masks is not None or not (self.facts.lost or self.facts.lenses[image_idx].whole):
             mask = view_mask(self._dataparser_outputs, image_idx)
             mask = self._scaled(mask, Image.Resampling.NEAREST)
             data["mask"] = torch.from_numpy(np.array(mask, dtype=bool))[..., None]
@@ -110,24 +108,12 @@ class BitymiDataset(InputDataset):
                     fill = fill.mul(255.0).round().to(image.dtype)
                 colors = torch.where(data["mask"], image[..., :3], fill)
                 data["image"] = torch.cat([colors, image[..., 3:]], -1)
-        if fitted := self._dataparser_outputs.metadata.get(FITTED):
+        if self.facts.fitted:
             size = (data["image"].shape[1], data["image"].shape[0])
-            maps = fitted[image_idx].read(self._lens(image_idx))
+            maps = self.facts.fitted[image_idx].read(self.facts.lenses[image_idx])
             data |= {name: resample_nearest(torch.from_numpy(values), *size).half() for name, values in maps.items()}
         data.update(self.get_metadata(data))
         return data
-
-    @property
-    def has_maps(self) -> bool:
-        """True if depth or normals of views are used."""
-        fitted = self._dataparser_outputs.metadata.get(FITTED, ())
-        return any(maps.fit is not None or maps.files.normal is not None for maps in fitted)
-
-    def _lens(self, image_idx: int) -> Lens:
-        return self._dataparser_outputs.metadata["lenses"][image_idx]
-
-    def _whole(self, image_idx: int) -> bool:
-        return NO_PHOTOS in self._dataparser_outputs.metadata or self._lens(image_idx).whole
 
     def _scaled(self, image: Image.Image, resample: Image.Resampling) -> Image.Image:
         if self.scale_factor == 1.0:
@@ -147,7 +133,8 @@ def photograph_bytes(device: torch.device, processes: int = 1) -> int:
 def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:
     """Read the mask of a view whose photograph has one, or does not cover the view."""
     path = None if outputs.mask_filenames is None else outputs.mask_filenames[index]
-    return outputs.metadata["lenses"][index].undistort_mask(None if path is None else checked_mask(path), path)
+    lens = CaptureFacts.of(outputs.metadata).lenses[index]
+    return lens.undistort_mask(None if path is None else checked_mask(path), path)
 
 
 class CachedImages(Sequence):

@@ -12,18 +12,17 @@ import numpy.typing as npt
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
-from bitymi_ns.capture.depth_normal_maps import MAPS, Values, read_depth, read_normal
+from bitymi_ns.capture.depth_normal_maps import Values, read_depth, read_normal
 from bitymi_ns.capture.image_files import in_threads, read_image
 from bitymi_ns.capture.lens import Lens, Pinhole
 from bitymi_ns.capture.points import GREY
-from bitymi_ns.capture.types import MapFiles
 from bitymi_ns.plugin.console import say, warn
+from bitymi_ns.plugin.data.facts import KEY, CaptureFacts, DepthFit, FittedMaps
 from bitymi_ns.ranges import spread
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
 """metric = one scale for all maps; relative = scale and shift of each; auto = by agreement with the points; off =
 unused."""
-FITTED = "fitted maps"  # metadata key of the views' `FittedMaps`
 SIDE = 320  # longest side of compared maps, pixels
 TOLERANCE = 0.05  # relative difference of depths of one surface
 FEW_PAIRS = 20  # fewest points in a photograph to fit scale and shift of its depth
@@ -38,34 +37,6 @@ PIXELS_PER_POINT = 30  # pixels of training photographs per initial point
 MOST_POINTS = 200_000  # initial points
 
 Floats = npt.NDArray[np.float64]
-
-
-class DepthFit(NamedTuple):
-    """Camera z in units of the scene from values v of a map: z, or 1 / z, is scale v + shift."""
-
-    scale: float
-    shift: float = 0.0
-    inverse: bool = False
-
-    def z(self, values: npt.NDArray[np.floating]) -> Values:
-        """Convert values; 0 = unknown."""
-        linear = self.scale * values + self.shift
-        known = (values > 0.0) & (linear > 0.0)
-        linear = np.where(known, linear, 1.0)
-        return np.where(known, 1.0 / linear if self.inverse else linear, 0.0).astype(np.float32)
-
-
-class FittedMaps(NamedTuple):
-    """Maps of a view in units of the scene; fit None = depth is unused."""
-
-    files: MapFiles
-    fit: DepthFit | None
-    unit: float | None
-
-    def read(self, lens: Lens) -> dict[str, Values]:
-        """Read depth [H, W] and normal [H, W, 3] if they are used, see `View`."""
-        found = {} if self.fit is None else {"depth": self.fit.z(read_depth(self.files, lens, self.unit))}
-        return found if self.files.normal is None else {**found, "normal": read_normal(self.files, lens)}
 
 
 class _Seen(NamedTuple):
@@ -88,20 +59,21 @@ class _Seen(NamedTuple):
 def with_depth(
     outputs: DataparserOutputs, kind: DepthKind = "auto", unit: float | None = None, add_points: bool = True
 ) -> DataparserOutputs:
-    """Fit depth maps of training views, downscaled to SIDE, to the scene; set `FittedMaps` in the metadata, and add
-    points from depth up to one per PIXELS_PER_POINT pixels. Raises InputError: a map cannot be read, or its shape is
-    not its photograph's."""
-    maps: Sequence[MapFiles] = outputs.metadata.get(MAPS) or []
+    """Fit depth maps of training views, downscaled to SIDE, to the scene, and add points from depth up to one per
+    PIXELS_PER_POINT pixels. Raises InputError: a map cannot be read, or its shape is not its photograph's."""
+    facts = CaptureFacts.of(outputs.metadata)
+    maps = facts.maps
     if kind == "off" or not maps:
         return outputs
-    _check_normals(outputs, maps)
+    _check_normals(facts)
     rows = [i for i, files in enumerate(maps) if files.depth is not None]
-    seen = _read_maps(outputs, rows, unit)
+    seen = _read_maps(outputs, facts, rows, unit)
     old = outputs.metadata.get("points3D_xyz", torch.zeros(0, 3))
     xyz = old.double().numpy()
     fits = _fits(seen, xyz[np.isfinite(xyz).all(1)], kind, float(outputs.dataparser_scale)) if rows else []
     fit_of = dict(zip(rows, fits, strict=True)) if fits is not None else {}
-    metadata = {**outputs.metadata, FITTED: [FittedMaps(files, fit_of.get(i), unit) for i, files in enumerate(maps)]}
+    fitted = [FittedMaps(files, fit_of.get(i), unit) for i, files in enumerate(maps)]
+    metadata = {**outputs.metadata, KEY: dataclasses.replace(facts, fitted=fitted)}
     used = [(i, each.fitted(fit_of[i])) for i, each in zip(rows, seen, strict=True) if fit_of.get(i) is not None]
     pixels = int((outputs.cameras.width.long() * outputs.cameras.height.long()).sum())
     count = min(MOST_POINTS, pixels // PIXELS_PER_POINT) - len(old) if add_points else 0
@@ -115,9 +87,9 @@ def with_depth(
     return dataclasses.replace(outputs, metadata=metadata)
 
 
-def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | None) -> list[_Seen]:
+def _read_maps(outputs: DataparserOutputs, facts: CaptureFacts, rows: Sequence[int], unit: float | None) -> list[_Seen]:
     """Read depth of views at small size."""
-    lenses, maps = outputs.metadata["lenses"], outputs.metadata[MAPS]
+    lenses, maps = facts.lenses, facts.maps
     small = {
         lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
         for lens in dict.fromkeys(lenses[i] for i in rows)
@@ -130,17 +102,17 @@ def _read_maps(outputs: DataparserOutputs, rows: Sequence[int], unit: float | No
     ]
 
 
-def _check_normals(outputs: DataparserOutputs, maps: Sequence[MapFiles]) -> None:
+def _check_normals(facts: CaptureFacts) -> None:
     """Warn of normals in another frame than the camera's."""
-    rows = [i for i, files in enumerate(maps) if files.normal is not None]
+    rows = [i for i, files in enumerate(facts.maps) if files.normal is not None]
     for i in [rows[k] for k in spread(len(rows), 8)]:
-        lens: Lens = outputs.metadata["lenses"][i]
-        normal = read_normal(maps[i], lens)
+        lens, files = facts.lenses[i], facts.maps[i]
+        normal = read_normal(files, lens)
         away = (normal * lens.pinhole.rays).sum(-1) > 0.0
         known = normal.any(-1)
         if known.any() and away[known].mean() > 0.2:
             warn(
-                f"{away[known].mean():.0%} of the normals of {maps[i].normal} face away from the camera: they are not "
+                f"{away[known].mean():.0%} of the normals of {files.normal} face away from the camera: they are not "
                 "in its frame (x right, y up, z back). Correct them, or train without: `bitymi-data --depth off`."
             )
             return

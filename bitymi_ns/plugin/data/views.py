@@ -12,17 +12,16 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.scene_box import SceneBox
 
-from bitymi_ns.capture.depth_normal_maps import MAPS
 from bitymi_ns.capture.lens import Lens, Pinhole, colmap_distortion, make_lenses
 from bitymi_ns.capture.pose_checks import check_spread, far_from_origin
 from bitymi_ns.capture.read import Capture
 from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, FrameOptions, MapFiles, Photograph, Pose
 from bitymi_ns.plugin.console import fail, listed, say
+from bitymi_ns.plugin.data.facts import KEY, CaptureFacts
 
 DATA = "BITYMI_DATA"
 """Environment variable with a capture's location, for which most of nerfstudio's commands have no option."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-NO_PHOTOS = "without photographs"  # metadata key of views of lost photographs; true: they are grey
 LONGEST_SIDE = 1600  # default longest side of training photographs, pixels; as in papers on such captures
 
 
@@ -34,10 +33,12 @@ class Views(DataparserOutputs):
         return super().transform_poses_to_original_space(poses.double(), *args, **kwargs)
 
 
-def make_views(capture: Capture, need_photos: bool = True) -> Views:
-    """Build a capture's views in the order of its photographs. Lists in metadata: `Lens` ("lenses"), photograph
-    ("files"), and its number ("photographs"), which views may share. `need_photos`: open downscaled copies for their
-    size; else they may be missing. Raises CaptureError: a camera or a photograph cannot be used."""
+def make_views(
+    capture: Capture, need_photos: bool = True, alpha_color: torch.Tensor | None = None
+) -> dict[str, DataparserOutputs]:
+    """Build a capture's views by part (train, val, test), in the order of its photographs. `need_photos`: open
+    downscaled copies for their size; else they may be missing. `alpha_color`: [3] behind transparent photographs.
+    Raises CaptureError: a camera or a photograph cannot be used."""
     photographs, frame, points, source = capture.photographs, capture.frame, capture.points, capture.source
     if len(photographs) == 1:
         fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")
@@ -48,47 +49,52 @@ def make_views(capture: Capture, need_photos: bool = True) -> Views:
     transform, scale = training_frame(poses, frame, source)
     moved = transform @ poses
     moved[:, :3, 3] *= scale
-    views = _split(parts, moved, [photograph.file for photograph in photographs])
-    metadata = views["metadata"]
-    lenses, of = metadata["lenses"], metadata["photographs"]
+    of, names, cameras, facts = _split(parts, moved, [photograph.file for photograph in photographs])
+    lenses = facts.lenses
     maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(of, lenses, strict=True)]
-    if any(each != MapFiles() for each in maps):
-        metadata[MAPS] = maps
     wide = [photographs[i].file for i, lens in zip(of, lenses, strict=True) if lens.face and photographs[i].maps.depth]
     if wide:
         say(f"Depth of photographs that become faces of a cube is not used: {listed(list(dict.fromkeys(wide)))}.")
+    facts = dataclasses.replace(
+        facts,
+        maps=maps if any(each != MapFiles() for each in maps) else (),
+        declares_box=capture.declares_box,
+        poses_report=capture.report,
+        poses_found=capture.model,
+    )
+    metadata: dict[str, Any] = {KEY: facts}
     if points is not None and len(points.xyz):
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * capture.applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
     masks = [photographs[i].mask for i in of]
     side = frame.scene_scale
-    return Views(
-        **views,
+    views = Views(
+        image_filenames=names,
+        cameras=cameras,
+        alpha_color=alpha_color,
+        metadata=metadata,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
         mask_filenames=masks if any(masks) else None,  # type: ignore[arg-type]  # some may have none
         dataparser_scale=scale * capture.applied_scale,
         dataparser_transform=torch.from_numpy(transform if capture.applied is None else transform @ capture.applied),
     )
+    chosen = {name: set(part) for name, part in capture.parts.items()}
+    return {name: select_views(views, [i for i, n in enumerate(of) if n in part]) for name, part in chosen.items()}
 
 
-def _split(parts: Sequence[Sequence[Lens]], poses: Pose, photographs: Sequence[Path]) -> dict[str, Any]:
+def _split(
+    parts: Sequence[Sequence[Lens]], poses: Pose, photographs: Sequence[Path]
+) -> tuple[list[int], list[Path], Cameras, CaptureFacts]:
     """Split photographs into views of their lenses (`parts`); poses [N, 3 or 4, 4] are camera to world in nerfstudio's
-    axes. Return names, cameras and metadata of the views' outputs."""
+    axes. Return the number of each view's photograph, and the views' names, cameras and facts."""
     lenses = [lens for some in parts for lens in some]
     of = [i for i, some in enumerate(parts) for _ in some]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
     files = [photographs[i] for i in of]
-    return {
-        "image_filenames": [lens.name(file) for file, lens in zip(files, lenses, strict=True)],
-        "cameras": pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(poses[of] @ turns).float()),
-        "metadata": {"lenses": lenses, "files": files, "photographs": of},
-    }
-
-
-def photograph_files(outputs: DataparserOutputs) -> list[Path]:
-    """Return the photograph of each view."""
-    return outputs.metadata.get("files", outputs.image_filenames)
+    cameras = pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(poses[of] @ turns).float())
+    names = [lens.name(file) for file, lens in zip(files, lenses, strict=True)]
+    return of, names, cameras, CaptureFacts(lenses, files)
 
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
@@ -135,7 +141,7 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
 def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
     """Add lenses to the outputs of any nerfstudio parser, with the lenses' pinholes as cameras."""
-    if "lenses" in outputs.metadata or NO_PHOTOS in outputs.metadata:
+    if KEY in outputs.metadata:
         return outputs
     cameras = outputs.cameras
     if cameras.camera_to_worlds.ndim != 3:  # nerfstudio's Cameras lose the dimension of a single view
@@ -152,10 +158,10 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         size = (int(cameras.width[i]), int(cameras.height[i]))
         camera = ColmapCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
-    views = _split(make_lenses(photographs), cameras.camera_to_worlds.double().numpy(), outputs.image_filenames)
-    outputs = select_views(outputs, views["metadata"]["photographs"])
-    views["metadata"] = {**outputs.metadata, **views["metadata"]}
-    return dataclasses.replace(outputs, **views)
+    poses = cameras.camera_to_worlds.double().numpy()
+    of, names, cameras, facts = _split(make_lenses(photographs), poses, outputs.image_filenames)
+    metadata = {**outputs.metadata, KEY: facts}
+    return dataclasses.replace(select_views(outputs, of), image_filenames=names, cameras=cameras, metadata=metadata)
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
@@ -164,7 +170,8 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     if longest < 0:
         how = "give a number of pixels, or 0 to use photographs as they are"
         fail(f"--pipeline.datamanager.longest-side is {longest}: {how}.")
-    lenses: list[Lens] = outputs.metadata.get("lenses", [])
+    facts = CaptureFacts.of(outputs.metadata)
+    lenses = facts.lenses
     sizes = [(lens.pinhole.width, lens.pinhole.height) for lens in lenses]
     large = [size for size in sizes if longest and max(size) > longest]
     if not large:
@@ -179,21 +186,17 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
             f"{width} x {height}): they are reduced. --pipeline.datamanager.longest-side 0 uses them as they are."
         )
     cameras = pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds)
-    return dataclasses.replace(outputs, cameras=cameras, metadata={**outputs.metadata, "lenses": lenses})
+    metadata = {**outputs.metadata, KEY: dataclasses.replace(facts, lenses=lenses)}
+    return dataclasses.replace(outputs, cameras=cameras, metadata=metadata)
 
 
 def select_views(outputs: DataparserOutputs, indices: Sequence[int]) -> DataparserOutputs:
     """Select views, with all that belongs to them."""
-    count = len(outputs.image_filenames)
     masks = outputs.mask_filenames
-    metadata = {
-        key: [value[i] for i in indices] if isinstance(value, list) and len(value) == count else value
-        for key, value in outputs.metadata.items()
-    }
     return dataclasses.replace(
         outputs,
         image_filenames=[outputs.image_filenames[i] for i in indices],
         mask_filenames=None if masks is None else [masks[i] for i in indices],
         cameras=outputs.cameras[torch.tensor(indices, dtype=torch.long)],
-        metadata=metadata,
+        metadata={**outputs.metadata, KEY: CaptureFacts.of(outputs.metadata).select(indices)},
     )

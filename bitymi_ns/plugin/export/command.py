@@ -184,7 +184,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 background = model.background.cpu()
                 photographs = datamanager.train_views
                 if polish or tune or refine.compact:
-                    photographs = corrected(photographs, exposure, datamanager.train_dataset.files)
+                    photographs = corrected(photographs, exposure, datamanager.train_dataset.facts.files)
                 learned = (options, refine, progress, held_out)
                 baked = bake(model.scene, views, photographs, background, *learned)
         except (ValueError, RuntimeError) as error:

@@ -63,7 +63,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
 def world_of(datamanager: Any) -> World:
     """Return the transform from the capture to the scene, with up and metres if this package's SfM found the poses."""
     outputs = datamanager.train_dataparser_outputs
-    report = getattr(datamanager.dataparser, "poses_report", None)
+    report = datamanager.train_dataset.facts.poses_report
     frame = None if report is None else read_frame(report)
     transform, scale = np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)
     return World(transform, scale) if frame is None else World(transform, scale, UP, frame.up, frame.metres_per_unit)

@@ -55,11 +55,11 @@ class TrainingRun:
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters
-        dataset, views, metadata = self.datamanager.train_dataset, self.datamanager.train_views, model.metadata
-        train, extent = dataset.cameras, scene_extent(metadata["camera_centers"], scene.surfels["means"])
+        dataset, views, facts = self.datamanager.train_dataset, self.datamanager.train_views, model.facts
+        train, extent = dataset.cameras, scene_extent(facts.camera_centers, scene.surfels["means"])
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
-        counts = (metadata["train_pixels"], metadata["first_surfels"], covered_share(views))
-        data = TrainingData(views, extent, *counts, exposure_stops(dataset.files), dataset.files, cameras)
+        counts = (facts.train_pixels, model.first_surfels, covered_share(views))
+        data = TrainingData(views, extent, *counts, exposure_stops(facts.files), facts.files, cameras)
         optimizers, processes = attributes.optimizers.optimizers, trainer.processes
         self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         attributes.optimizers.before_step = self.training.combine
@@ -93,10 +93,9 @@ class TrainingRun:
         learns = scene.config.texture == "texels"
         texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
         pixels, schedule = [camera.width * camera.height for camera in cameras], self.training.schedule
-        surfels = expected_surfels(
-            schedule, metadata["first_surfels"], sum(pixels) / len(pixels), self.training.strategy.most
-        )
-        lists = schedule.lists_fragments(self.datamanager.train_dataset.has_maps)
+        mean = sum(pixels) / len(pixels)
+        surfels = expected_surfels(schedule, model.first_surfels, mean, self.training.strategy.most)
+        lists = schedule.lists_fragments(facts.has_maps)
         most = max(len(scene), int(surfels[self.first_step :].max(initial=0)))
         state_training(scene, cameras, most, texels, to_come, trainer.world_size, lists)
         self.forecast = self._forecast(pixels, surfels)

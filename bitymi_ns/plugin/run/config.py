@@ -23,7 +23,7 @@ from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.files import write_errors_as, write_file
 from bitymi_ns.plugin import hooks
 from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
-from bitymi_ns.plugin.data.capture_checks import check_capture
+from bitymi_ns.plugin.data.capture_checks import check_capture, read_early
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
@@ -140,11 +140,11 @@ class BitymiTrainerConfig(TrainerConfig):
         """Check capture and output folder, write config.yml, the run's first file, and print a summary."""
         if not torchrun.own().first:
             return
-        poses_as = check_capture(self.pipeline.datamanager, read=True)
-        recorded = self
-        if poses_as is not None:
+        check_capture(self.pipeline.datamanager)
+        recorded, capture = self, read_early(self.pipeline.datamanager)
+        if capture is not None:
             recorded = copy.deepcopy(self)
-            recorded.pipeline.datamanager.dataparser.poses_as = poses_as
+            recorded.pipeline.datamanager.dataparser.poses_as = capture.poses_as
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
             run_folder.check_unused(folder, self.get_checkpoint_dir())

@@ -17,6 +17,7 @@ from torch.nn import Parameter
 
 from bitymi_ns.ops.view_kinds import PARAMETERS
 from bitymi_ns.plugin.console import fail, say, warn
+from bitymi_ns.plugin.data.facts import CaptureFacts
 from bitymi_ns.plugin.run.callbacks import TrainingRun
 from bitymi_ns.plugin.run.checkpoints import STATE_VERSION
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
@@ -25,6 +26,7 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train import messages
+from bitymi_ns.train.background_points import background_points
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.init import build_scene, limit_first_surfels
 from bitymi_ns.train.losses import photometric
@@ -72,14 +74,12 @@ class BitymiModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        self.metadata: dict[str, Any] = self.kwargs.get("metadata") or {}
-        self.train_config = train_config_for(
-            self.config.train, self.metadata.get("alpha_color"), bool(self.metadata.get("transparent"))
-        )
+        self.facts = CaptureFacts.of(self.kwargs.get("metadata") or {})
+        self.train_config = train_config_for(self.config.train, self.facts.alpha_color, self.facts.transparent)
         points = self.kwargs.pop("seed_points", None)
         config, steps = self.config.scene, self.config.steps
-        self.scene = new_scene(points, self.scene_box, config, self.train_config, self.metadata, steps)
-        self.metadata["first_surfels"] = len(self.scene)  # checkpoints may have another number
+        self.scene = new_scene(points, self.scene_box, config, self.train_config, self.facts, steps)
+        self.first_surfels = len(self.scene)  # checkpoints may have another number
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
         self.recorded_options: str | None = None  # of a resumed run
@@ -168,7 +168,7 @@ class BitymiModel(SurfelModel):
         """Return tensors, numbers and text only, for torch's safe mode."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
         state["train"] = messages.recorded(self.train_config)
-        state["near"], state["first_surfels"] = self.scene.near, self.metadata["first_surfels"]
+        state["near"], state["first_surfels"] = self.scene.near, self.first_surfels
         if self._run is not None:
             state["trained_for"] = self._run.total
             state["run"] = self._run.state()
@@ -179,7 +179,7 @@ class BitymiModel(SurfelModel):
     def set_extra_state(self, state: Any) -> None:
         self.trained_for = state.get("trained_for")
         self.resume_state, self.recorded_options = state.get("run", {}), state.get("train")
-        self.metadata["first_surfels"] = state.get("first_surfels", self.metadata["first_surfels"])
+        self.first_surfels = state.get("first_surfels", self.first_surfels)
         if self.config.scene.near is None:
             self.scene.near = state.get("near", 0.2)  # all scenes' value in older checkpoints
 
@@ -203,12 +203,12 @@ def new_scene(
     scene_box: SceneBox | None,
     config: SceneConfig,
     train: TrainConfig,
-    metadata: dict[str, Any],
+    facts: CaptureFacts,
     steps: int | None = None,
 ) -> Scene:
     """Make surfels at points (positions [N, 3], colours [N, 3] uint8 or empty), or at random in the capture's box, and
-    an empty texture field around them; `metadata` is the data manager's, `steps` the length of a run to come."""
-    centers, pixels = metadata.get("camera_centers", torch.zeros(0, 3)), metadata.get("train_pixels", 0)
+    an empty texture field around them; `steps`: the length of a run to come."""
+    centers, pixels = facts.camera_centers, facts.train_pixels
     if steps is not None:
         train = limit_first_surfels(train, steps, pixels, len(centers))
     xyz, rgb = points or (torch.zeros(0, 3), torch.zeros(0, 3))
@@ -218,8 +218,7 @@ def new_scene(
     else:  # a cloud without colours
         rgb = torch.full_like(xyz, 0.5, dtype=torch.float32)
     xyz = xyz.float()
-    find_background = metadata.get("background_points")
-    declared = _corners(scene_box) if metadata.get("declares_box") else None
+    declared = None if scene_box is None or not facts.declares_box else _corners(scene_box)
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
         if len(xyz):
@@ -229,9 +228,10 @@ def new_scene(
     many, started = len(xyz) >= MANY_POINTS, time.perf_counter()
     if many:
         say(f"Making surfels of {len(xyz):,} points. This may take minutes.")
-    background = find_background() if find_background and train.background_points else None
-    bounded = metadata.get("has_alpha", False)
-    scene, report = build_scene(xyz, rgb, centers, config, train, bounded, pixels, box, declared, background)
+    background, views = None, facts.background_views
+    if len(xyz) and len(views) and train.background_points:  # reads the photographs
+        background = background_points(xyz, views, facts.seed)
+    scene, report = build_scene(xyz, rgb, centers, config, train, facts.has_alpha, pixels, box, declared, background)
     if many:
         say(f"Making surfels took {time.perf_counter() - started:.1f} s.")
     for sentence in messages.warnings_at_start(report, train, pixels, config):

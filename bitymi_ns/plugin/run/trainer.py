@@ -80,9 +80,8 @@ class BitymiTrainer(Trainer):
         except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
             raise SystemExit(INTERRUPTED) from None
-        parser = self.pipeline.datamanager.dataparser
-        found = (getattr(parser, name, None) for name in ("poses_report", "sfm_source"))
-        run_folder.keep_poses_report(self.base_dir, *found)
+        facts = self.pipeline.datamanager.train_dataset.facts
+        run_folder.keep_poses_report(self.base_dir, facts.poses_report, facts.poses_found)
         for line in getattr(self.viewer_state, "viewer_info", []):
             CONSOLE.print(line, soft_wrap=True)
         # last callback of a step: the complete state can be saved

@@ -72,8 +72,8 @@ def add_alpha(paths: list[Path], alpha: int) -> None:
 def test_alpha_is_kept_for_the_model(capture: Path) -> None:
     add_alpha(images_of(capture), 0)
     manager = load(capture)
-    assert manager.train_dataset.metadata["has_alpha"] is True
-    assert manager.train_dataset.metadata["transparent"] is True
+    assert manager.train_dataset.facts.has_alpha is True
+    assert manager.train_dataset.facts.transparent is True
     assert manager.cached_train[0]["image"].shape[-1] == 4
     assert manager.train_dataset[0]["image"].shape[-1] == 3  # for viewer and ns-render
 
@@ -81,10 +81,10 @@ def test_alpha_is_kept_for_the_model(capture: Path) -> None:
 def test_an_alpha_channel_without_a_transparent_pixel_is_none(capture: Path) -> None:
     add_alpha(images_of(capture), 255)
     manager = load(capture)
-    assert manager.train_dataset.metadata["transparent"] is False
+    assert manager.train_dataset.facts.transparent is False
     assert manager.cached_train[0]["image"].shape[-1] == 3
     add_alpha(images_of(capture)[1:], 0)
-    assert load(capture).train_dataset.metadata["transparent"] is True
+    assert load(capture).train_dataset.facts.transparent is True
 
 
 def test_the_colour_behind_transparent_photographs() -> None:

@@ -39,15 +39,21 @@ def large_room(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def capture(large_room: Path, tmp_path: Path) -> Path:
-    readings._decided.clear()
     return Path(shutil.copytree(large_room, tmp_path / "room"))
 
 
-def decided() -> str:
-    """Return the reading that matches decided, of which there were enough."""
-    (decision,) = readings._decided.values()
-    assert decision.reading is not None and decision.share > 0.5
-    return decision.reading.name
+@pytest.fixture
+def decided(monkeypatch: pytest.MonkeyPatch) -> Callable[[], str]:
+    """A function that returns the reading that matches decided, once, and of which there were enough."""
+    decisions, decide = [], readings.decide
+    monkeypatch.setattr(readings, "decide", lambda *given: decisions.append(decide(*given)) or decisions[-1])
+
+    def decided() -> str:
+        (decision,) = decisions
+        assert decision.reading is not None and decision.share > 0.5
+        return decision.reading.name
+
+    return decided
 
 
 def of_json(capture: Path, change: Change) -> Path:
@@ -86,7 +92,7 @@ def of_scan(capture: Path, change: Change) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("form", [*JSON, model, *SCANS, stray_scanner])
 def test_right_ones_are_nothing_to_speak_of(
-    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+    capture: Path, form: Callable[[Path], Path], decided: Callable[[], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     place = form(capture)
     load_any(capture if place.is_relative_to(capture) else place)
@@ -110,7 +116,11 @@ def test_right_ones_are_nothing_to_speak_of(
     ],
 )  # fmt: skip
 def test_others_are_read_as_meant(
-    capture: Path, write: Callable[[Path], Path], name: str, capsys: pytest.CaptureFixture[str]
+    capture: Path,
+    write: Callable[[Path], Path],
+    name: str,
+    decided: Callable[[], str],
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     right = load_any(capture, poses_as="written").train_dataset.cameras.camera_to_worlds
     data = write(capture)
@@ -132,7 +142,7 @@ def relative(poses: Any) -> Any:
     return local / np.linalg.norm(local[1])
 
 
-def test_a_left_handed_world_is_mirrored_with_its_cloud(capture: Path) -> None:
+def test_a_left_handed_world_is_mirrored_with_its_cloud(capture: Path, decided: Callable[[], str]) -> None:
     right = load_any(capture, poses_as="written").train_dataparser_outputs
     of_json(capture, lambda pose: MIRROR @ pose @ MIRROR)
     cloud = capture / "sparse_pc.ply"
@@ -144,7 +154,7 @@ def test_a_left_handed_world_is_mirrored_with_its_cloud(capture: Path) -> None:
     np.testing.assert_allclose(found.cameras.camera_to_worlds, right.cameras.camera_to_worlds, atol=1e-5)
 
 
-def test_cameras_at_one_place_as_written(capture: Path) -> None:
+def test_cameras_at_one_place_as_written(capture: Path, decided: Callable[[], str]) -> None:
     """Poses of a turntable, read in the wrong direction, put all cameras at one place: no reason to stop."""
     edit(capture, lambda meta: meta.pop("ply_file_path"))
     of_json(capture, lambda pose: np.linalg.inv(pose))
@@ -177,7 +187,7 @@ def test_a_run_records_its_reading(capture: Path, tmp_path: Path) -> None:
     recorded.data = capture
     parser = recorded.setup()
     parser.downscale_factor = 1  # how nerfstudio says that photographs are not needed
-    assert parser.get_dataparser_outputs("train").cameras.shape and parser.poses_as == "opencv-c2w"
+    assert parser.get_dataparser_outputs("train").cameras.shape and parser.capture.poses_as == "opencv-c2w"
     path.write_text("".join(line for line in path.read_text().splitlines(True) if "poses_as" not in line))
     assert yaml.load(path.read_text(), yaml.UnsafeLoader).pipeline.datamanager.dataparser.poses_as == "written"
     resumed = configured(load_dir=path.parent / "nerfstudio_models").pipeline.datamanager.dataparser

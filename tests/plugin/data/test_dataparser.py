@@ -22,6 +22,7 @@ from bitymi_ns.capture.read import OPTION_FORMATS
 from bitymi_ns.plugin import methods
 from bitymi_ns.plugin.data.capture_checks import bitymi_parser
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
+from bitymi_ns.plugin.data.facts import CaptureFacts
 from bitymi_ns.plugin.data.views import with_lenses
 from tests.captures import (
     colmap_model,
@@ -219,9 +220,9 @@ def test_a_blender_data_set_has_its_own_split_and_alpha(blender: Path, capsys: p
     text = printed(capsys)
     assert f"Reading {blender}/transforms_train.json (blender, 6 photographs)." in text
     assert "Held out for evaluation: 2 of transforms_val.json and 2 of transforms_test.json." in text
-    assert one.train_dataset.metadata["has_alpha"] and one.cached_train[0]["image"].shape == (8, 8, 4)
-    assert torch.equal(one.train_dataset.metadata["alpha_color"], torch.ones(3))
-    assert load_any(blender, alpha_color=None).train_dataset.metadata["alpha_color"] is None
+    assert one.train_dataset.facts.has_alpha and one.cached_train[0]["image"].shape == (8, 8, 4)
+    assert torch.equal(one.train_dataset.facts.alpha_color, torch.ones(3))
+    assert load_any(blender, alpha_color=None).train_dataset.facts.alpha_color is None
     with expect("--eval-names is not for .* read as blender"):
         load_any(blender, eval_names=("r_0.png",))
 
@@ -249,7 +250,7 @@ def test_instant_ngps_transforms(capture: Path, capsys: pytest.CaptureFixture[st
     assert "transforms.json (instant-ngp, 12 photographs)" in text
     assert "If nerfstudio wrote it: `bitymi-data --format nerfstudio`." in text
     assert held_out(one) == ["frame_00001.png", "frame_00009.png"]
-    assert one.train_dataset.metadata["declares_box"] is True
+    assert one.train_dataset.facts.declares_box is True
     assert one.train_dataset.scene_box.aabb.tolist() == [[-2.0] * 3, [2.0] * 3]
     theirs = InstantNGPDataParserConfig(data=capture, eval_mode="all").setup().get_dataparser_outputs("train")
     places = {p.name: c[:, 3] for p, c in zip(theirs.image_filenames, theirs.cameras.camera_to_worlds, strict=True)}
@@ -322,7 +323,7 @@ def test_parsers_of_other_formats_are_undistorted_by_lenses(capture: Path) -> No
              meta.update(distortion))  # fmt: skip
         ours = load_any(capture)
         read = with_lenses(stock(capture, eval_mode="interval").get_dataparser_outputs("train"))
-        for one, other in zip(read.metadata["lenses"], ours.train_dataset.metadata["lenses"], strict=True):
+        for one, other in zip(CaptureFacts.of(read.metadata).lenses, ours.train_dataset.facts.lenses, strict=True):
             assert one.camera.model == other.camera.model and one.pinhole.width == other.pinhole.width
             assert one.camera.params == pytest.approx(other.camera.params, rel=1e-6)
 

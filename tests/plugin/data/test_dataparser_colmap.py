@@ -74,7 +74,7 @@ def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: 
             assert isinstance(view, View) and view.image.shape[:2] == (view.camera.height, view.camera.width)
             sizes.add(tuple(view.image.shape[:2]))
     assert len(sizes) == 3 and (40, 30) in sizes
-    assert manager.train_dataset.metadata["train_pixels"] == sum(
+    assert manager.train_dataset.facts.train_pixels == sum(
         view.image.shape[0] * view.image.shape[1] for view in manager.train_views
     )
 

@@ -35,7 +35,7 @@ def test_cameras_and_pictures_are_reduced_together(capture: Path, capsys: pytest
         mean = large.image.float().view(18, 2, 24, 2, 3).mean((1, 3))
         assert (small.image.float() - mean).abs().max() <= 1.0  # PIL rounds after each direction
     assert half.eval_views[0].image.shape == (18, 24, 3)
-    assert half.train_dataset.metadata["train_pixels"] == len(half.train_dataset) * 18 * 24
+    assert half.train_dataset.facts.train_pixels == len(half.train_dataset) * 18 * 24
 
 
 def test_odd_sizes_keep_the_rays_of_the_corners(capture: Path) -> None:

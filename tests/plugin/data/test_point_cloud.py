@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from bitymi_ns.capture.points import read_cloud
+from bitymi_ns.plugin.data.facts import CaptureFacts
 from bitymi_ns.plugin.run.model import new_scene
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import TrainConfig
@@ -77,7 +78,7 @@ def test_other_files(tmp_path: Path) -> None:
 
 def test_a_handful_of_points_is_doubted(capsys: pytest.CaptureFixture[str]) -> None:
     one_place = torch.zeros(80, 3)
-    new_scene((one_place, one_place), None, SceneConfig(texture="none"), TrainConfig(), {})
+    new_scene((one_place, one_place), None, SceneConfig(texture="none"), TrainConfig(), CaptureFacts())
     assert "has only 1 different points to start from" in " ".join(capsys.readouterr().out.split())
 
 

@@ -37,11 +37,11 @@ def test_scans_are_read_with_their_poses(
         np.testing.assert_allclose(here, scale * there, atol=1e-4)
     assert np.allclose(other.cameras.fx, one.cameras.fx, atol=1e-3) and np.allclose(other.cameras.cy, one.cameras.cy)
     assert b[:, 2, 1].mean() > 0.5  # z is up
-    depth = [each.depth for each in other.metadata.get("maps", [])]
+    depth = [each.depth for each in other.facts.maps]
     assert len(set(depth)) == (0 if layout is seven_scenes else 12)
     if layout is scanner_app:
-        assert other.metadata["maps"][1].depth.name == "depth_00005.png"
-        assert other.metadata["maps"][1].confidence.name == "conf_00005.png"
+        assert other.facts.maps[1].depth.name == "depth_00005.png"
+        assert other.facts.maps[1].confidence.name == "conf_00005.png"
     assert "12 photographs with their poses" in (text := printed(capsys))
     assert "depth maps" in text or "depth map" in text
 
@@ -85,10 +85,10 @@ def test_a_capture_of_stray_scanner(capture: Path, capsys: pytest.CaptureFixture
     for i, number in enumerate(shown):  # picture and pose belong together
         difference = np.abs(other.get_numpy_image(i).astype(int) - one.get_numpy_image(number).astype(int))
         assert difference.mean() < 12
-    maps = other.metadata["maps"]
+    maps = other.facts.maps
     assert [each.depth.name for each in maps] == [f"{number:06d}.png" for number in shown]
     assert all(each.confidence == folder / f"confidence/{each.depth.name}" for each in maps)
-    for number, files, lens in zip(shown, maps, other.metadata["lenses"], strict=True):
+    for number, files, lens in zip(shown, maps, other.facts.lenses, strict=True):
         assert np.allclose(read_depth(files, lens), 0.0 if number == 3 else 2.0)
     apart = np.linalg.norm(b[1:, :, 3] - b[0, :, 3], axis=1) / other._dataparser_outputs.dataparser_scale
     poses = np.array([frame["transform_matrix"] for frame in frames])[shown]

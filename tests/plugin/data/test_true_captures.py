@@ -137,7 +137,7 @@ def test_a_camera_model_wherever_it_stands(
 
     edit(place, change)
     manager = load_any(place)
-    lenses = [lens for data in (manager.train_dataset, manager.eval_dataset) for lens in data.metadata["lenses"]]
+    lenses = [lens for data in (manager.train_dataset, manager.eval_dataset) for lens in data.facts.lenses]
     fisheyes = [lens for lens in lenses if lens.camera.model == "OPENCV_FISHEYE"]
     assert len(fisheyes) == (6 if which == "some frames" else 12)
     assert fisheyes[0].camera.params[4:] == (0.01, 0.0, 0.0, 0.001)
@@ -149,7 +149,7 @@ def test_aria_s_camera(capture: Path) -> None:
     params = [0.02, -0.01, 0.004, 0.001, -0.0005, 0.0001, 0.002, -0.001, 0.0015, -0.0007, 0.0004, 0.0003]
     camera = {"camera_model": "FISHEYE624", "fl_x": 20.0, "fl_y": 20.0, "distortion_params": params}
     edit(capture, lambda meta: meta.update(camera))
-    lens = load_any(capture).train_dataset.metadata["lenses"][0]
+    lens = load_any(capture).train_dataset.facts.lenses[0]
     assert lens.camera.model == "RAD_TAN_THIN_PRISM_FISHEYE"
     rays = torch.tensor([[0.1, 0.2, 1.0], [-0.5, 0.3, 1.0], [0.4, -0.6, 1.0]])
     theirs = fisheye624_project(rays[None], torch.tensor([[20.0, *lens.camera.params[2:4], *params]]))[0]
@@ -165,9 +165,9 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path) -> None:
     manager = load_any(capture)
     train = manager.train_dataset
     index = train.image_filenames.index(path)
-    assert train.metadata["lenses"][index].camera.size == (96, 72) and int(train.cameras.width[index - 1]) == 48
+    assert train.facts.lenses[index].camera.size == (96, 72) and int(train.cameras.width[index - 1]) == 48
     assert float(train.cameras.fy[index]) == 81.0 and float(train.cameras.fy[index - 1]) != 81.0
-    assert [lens.distorts for lens in train.metadata["lenses"][index - 1 : index + 1]] == [False, True]
+    assert [lens.distorts for lens in train.facts.lenses[index - 1 : index + 1]] == [False, True]
     assert len(manager.cached_train) == 10
 
 

@@ -11,7 +11,8 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from PIL import Image
 
 from bitymi_ns.capture.lens import FACES
-from bitymi_ns.plugin.data.views import photograph_files, with_lenses
+from bitymi_ns.plugin.data.facts import CaptureFacts
+from bitymi_ns.plugin.data.views import with_lenses
 from tests.captures import as_binary, colmap_model, edit, edit_frames, expect, held_out, images_of, load_any, printed
 
 SIZE = (96, 48)
@@ -65,7 +66,7 @@ def test_a_mask_goes_with_each_face_and_a_face_without_pixels_is_left_out(
     edit_frames(capture, lambda frame: frame.update(mask_path="mask.png"))
     manager = load_any(capture)
     assert "These views are left out" in printed(capsys)
-    files = manager.train_dataset.files
+    files = manager.train_dataset.facts.files
     assert len(files) == 5 * (count - 2) and len(set(files)) == count - 2
     assert not any(path.stem.endswith("down") for path in manager.train_dataset.image_filenames)
     front = manager.train_view(0)[1]["mask"][..., 0]
@@ -101,7 +102,7 @@ def test_views_of_another_parser_are_split_too(capture: Path) -> None:
     stock = NerfstudioDataParserConfig(data=capture).setup().get_dataparser_outputs("train")
     outputs = with_lenses(stock)
     assert len(outputs.image_filenames) == 6 * len(stock.image_filenames) == len(outputs.cameras)
-    assert photograph_files(outputs)[:6] == [stock.image_filenames[0]] * 6
+    assert CaptureFacts.of(outputs.metadata).files[:6] == [stock.image_filenames[0]] * 6
     assert torch.allclose(outputs.cameras.camera_to_worlds[0], stock.cameras.camera_to_worlds[0])
 
 

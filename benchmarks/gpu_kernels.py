@@ -32,13 +32,14 @@ def training(n: int, width: int, height: int, device: torch.device, tiled: bool 
     if `tiled`. `most`: limit of a fragment list, 0 = none."""
     scene, camera = (with_texels if tiled else trained_like)(n, width, height, device)
     scene.config.max_fragments = most
-    # learning rate 0: the work of a step without changing the scene
+    # rates 0: the work of a step without changing the scene
+    descent = ops.TexelDescent(scene.field.share, 0.0) if tiled else None
     optimizer = torch.optim.Adam((scene.surfels if tiled else scene).parameters(), lr=0.0, fused=True)
     photo = torch.rand(height, width, 3, device=device)
 
     def run() -> None:
         optimizer.zero_grad(set_to_none=True)
-        rgb = scene.render(camera, field_mode="train").rgb
+        rgb = scene.render(camera, descent=descent).rgb
         (0.8 * l1_loss(rgb, photo) + 0.2 * (1 - ops.ssim(rgb, photo))).backward()
         optimizer.step()
 

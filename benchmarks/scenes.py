@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 import bitymi_ns
-from bitymi_ns import ops
 from bitymi_ns.bundle import Bundle
 from bitymi_ns.capture.types import OPENCV_AXES
 from bitymi_ns.codec.packing import pack
@@ -93,15 +92,13 @@ def _move_beside_the_camera(surfels: dict[str, Tensor], g: torch.Generator) -> N
 
 
 def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[Scene, Camera]:
-    """Generate `trained_like` with a tile per surfel at the camera's resolution, and random texels that backward passes
-    update at rate 0: the work of a step without changing them."""
+    """Generate `trained_like` with a tile per surfel at the camera's resolution, and random texels."""
     scene, camera = trained_like(n, width, height, device, texture=False)
     scene.config.texture = "texels"
     field = blank_texels(scene, [View(camera, torch.zeros(height, width, 3, device=device))], 1, TexelConfig())
     g = torch.Generator().manual_seed(1)
     with torch.no_grad():
         field.texels.copy_(0.1 * torch.randn(field.texels.shape, generator=g))
-    field.descent = ops.TexelDescent(field.share, 0.0)
     scene.field = field
     return scene, camera
 

@@ -25,7 +25,13 @@ class ResidualField(nn.Module):
     """Residual colours of fragments, added to the surfels' view-dependent colours."""
 
     def residual(
-        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+        self,
+        fragments: Fragments,
+        frames: Tensor,
+        bound: float,
+        learns: bool,
+        descent: TexelDescent | None = None,
+        read: Tensor | None = None,
     ) -> dict[str, Any]:
         """Compute the residual of a view, as arguments of `blended_image`.
 
@@ -33,25 +39,23 @@ class ResidualField(nn.Module):
             frames: [N, 9] of the view's `Projection`.
             bound: fragments of smaller weight have no residual.
             learns: compute gradients.
-            read: result of `snapshot`, for a view rendered in bands.
+            descent: update of learning texels by the backward pass; None: they get a gradient.
+            read: copy of the texels before the backward pass, for a view rendered in bands.
         """
-        found = self.texture(bound, learns, read)
+        found = self.texture(bound, learns, descent, read)
         if found is None:
             raise NotImplementedError
         return found
 
-    def texture(self, bound: float, learns: bool, read: Tensor | None = None) -> dict[str, Any] | None:
+    def texture(
+        self, bound: float, learns: bool, descent: TexelDescent | None = None, read: Tensor | None = None
+    ) -> dict[str, Any] | None:
         """Return the arguments of `blended_image` if the residual is a texture (texels [T, 3], tiles), else None.
         Arguments as in `residual`."""
         return None
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
         """Return opacities of texels, with or without gradients, see `ops.TexelAlpha`; None: opaque texels."""
-        return None
-
-    def snapshot(self) -> Tensor | None:
-        """Copy the state that bands of a view read, because the backward pass of one band may update the field before
-        another is rendered again; None: the backward pass changes nothing."""
         return None
 
 
@@ -108,7 +112,13 @@ class HashField(ResidualField):
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
     def residual(
-        self, fragments: Fragments, frames: Tensor, bound: float, learns: bool, read: Tensor | None = None
+        self,
+        fragments: Fragments,
+        frames: Tensor,
+        bound: float,
+        learns: bool,
+        descent: TexelDescent | None = None,
+        read: Tensor | None = None,
     ) -> dict[str, Any]:
         weights = self.weights if learns else tuple(w.detach() for w in self.weights)
         moves = learns and self._moves_surfels
@@ -160,8 +170,6 @@ class TexelField(ResidualField):
         self.register_buffer("size", size.to(torch.int32).clone())
         self.register_buffer("extent", extent.detach().to(texels).clone())
         self.register_buffer("share", texels.new_zeros(len(texels)) if share is None else share.detach().clone())
-        self.descent: TexelDescent | None = None
-        """Update of the texels by a backward pass; None: they get a gradient."""
         self._tiles: tuple[Tensor, int, TexelTiles] | None = None
 
     @classmethod
@@ -186,8 +194,9 @@ class TexelField(ResidualField):
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])
         self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
 
-    def texture(self, bound: float, learns: bool, read: Tensor | None = None) -> dict[str, Any]:
-        descent = self.descent if learns else None
+    def texture(
+        self, bound: float, learns: bool, descent: TexelDescent | None = None, read: Tensor | None = None
+    ) -> dict[str, Any]:
         texels = self.texels if learns and descent is None else self.texels.detach()
         if descent is not None and read is not None:
             texels, descent = read, replace(descent, moved=texels)
@@ -198,6 +207,3 @@ class TexelField(ResidualField):
         if self.alpha is None:
             return None
         return TexelAlpha(self.tiles, self.alpha if learns else self.alpha.detach(), bound)
-
-    def snapshot(self) -> Tensor | None:
-        return None if self.descent is None else self.texels.detach().clone()

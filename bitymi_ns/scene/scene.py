@@ -15,6 +15,7 @@ from bitymi_ns.ops import (
     Fragments,
     Marks,
     Projection,
+    TexelDescent,
     TooManyFragments,
     blended_image,
     can_rasterize,
@@ -158,6 +159,7 @@ class Scene(nn.Module):
         field_mode: Literal["train", "frozen", "off"] = "train",
         maps: bool = False,
         overdraw_half: float | None = None,
+        descent: TexelDescent | None = None,
     ) -> RenderOutput:
         """Render a view: visibility, then shading, then compositing.
 
@@ -169,6 +171,7 @@ class Scene(nn.Module):
             field_mode: train = residual with gradients; frozen = residual without gradients; off = no residual.
             maps: also render depth and normals.
             overdraw_half: also render the soft overdraw, see `ops.soft_overdraw`; None: no.
+            descent: update of the texels of a `TexelField` by the backward pass; None: they get a gradient.
 
         Raises:
             TooManyFragments: a single row of screen tiles has too many.
@@ -177,9 +180,10 @@ class Scene(nn.Module):
         p = self.surfels
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
+        descent = descent if learns else None
         alpha = None if self.field is None else self.field.opacity(bound, learns)
         projection = project(*(p[name] for name in GEOMETRY), camera, self.near, alpha=alpha)
-        texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode)
+        texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode, descent)
         base = self.base_color(projection)
         if texture is not None:
             image, marks = rasterize_image(projection, base, **texture, rim=self.config.rim)
@@ -188,7 +192,7 @@ class Scene(nn.Module):
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
             fragments = trace(part, self.config.rim, most)
-            residual = {} if field is None else field.residual(fragments, part.frames, bound, learns, read)
+            residual = {} if field is None else field.residual(fragments, part.frames, bound, learns, descent, read)
             image = blended_image(fragments, part, base, maps=maps, **residual)
             if overdraw_half is not None:
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
@@ -197,18 +201,20 @@ class Scene(nn.Module):
         try:
             image, fragments = draw(projection, self.config.max_fragments)
         except TooManyFragments as error:
-            if field is not None and learns:
-                read = field.snapshot()
+            if descent is not None:  # the backward pass of a band moves texels before another is rendered again
+                read = self.field.texels.detach().clone()
             image, fragments = draw_in_bands(projection, draw, error, self.config.max_fragments, self.config.rim)
         return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)
 
-    def _unlisted_texture(self, field_mode: Literal["train", "frozen", "off"]) -> dict[str, Any] | None:
+    def _unlisted_texture(
+        self, field_mode: Literal["train", "frozen", "off"], descent: TexelDescent | None
+    ) -> dict[str, Any] | None:
         """Return the texel arguments of `rasterize_image`, {} without texels; None if views need fragment lists."""
         if self.config.max_fragments or not can_rasterize(self.surfels["means"].device):
             return None
         if self.field is None or field_mode == "off":
             return None if isinstance(self.field, TexelField) and self.field.alpha is not None else {}
-        return self.field.texture(self.config.weight_bound, field_mode == "train")
+        return self.field.texture(self.config.weight_bound, field_mode == "train", descent)
 
     def compare(
         self,
@@ -216,10 +222,12 @@ class Scene(nn.Module):
         photograph: PhotographTarget,
         correction: Tensor | None = None,
         field_mode: Literal["train", "frozen"] = "train",
+        descent: TexelDescent | None = None,
     ) -> ComparedView | None:
         """Draw a view and compare it with its photograph, see `ops.training_view`; None if views need fragment lists.
-        `correction`: colour correction, [3] or [3, 4], see `train.views.View`. `field_mode`: as in `render`."""
-        texture = self._unlisted_texture(field_mode)
+        `correction`: colour correction, [3] or [3, 4], see `train.views.View`. `field_mode`, `descent`: as in
+        `render`."""
+        texture = self._unlisted_texture(field_mode, descent if field_mode == "train" else None)
         if texture is None:
             return None
         alpha = None if self.field is None else self.field.opacity(self.config.weight_bound, field_mode == "train")

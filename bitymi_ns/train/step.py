@@ -33,6 +33,7 @@ from bitymi_ns.train.texels import LearningTexels
 from bitymi_ns.train.views import DownscaledViews, TrainingData, View, at_size, background_changes, step_background
 
 if TYPE_CHECKING:
+    from bitymi_ns.ops import TexelDescent
     from bitymi_ns.ops.project import Projection
     from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import Scene
@@ -41,7 +42,13 @@ TIMED_VIEWS = 3  # views that tell what a step takes at another size
 
 
 def view_losses(
-    scene: Scene, view: View, schedule: Schedule, step: int, watch: LossWatch, background: Tensor | None = None
+    scene: Scene,
+    view: View,
+    schedule: Schedule,
+    step: int,
+    watch: LossWatch,
+    background: Tensor | None = None,
+    descent: TexelDescent | None = None,
 ) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
     """Render a training view and compare it with its photograph.
 
@@ -49,6 +56,7 @@ def view_losses(
         view: on the scene's device, with its image at its camera's size.
         schedule, step: decide which parts of the scene are trained.
         background: [3] colour behind the scene, where it is constant over steps; None: as the options say.
+        descent: see `Scene.render`.
 
     Returns:
         The weighted loss terms (their sum is the objective) and the rendered view: a `ComparedView` without image if
@@ -68,8 +76,8 @@ def view_losses(
     compared: ComparedView | None = None
     if not maps and overdraw_half is None and fused_losses(loss, target):
         photograph = photograph_target(target, loss, view.mask, background)
-        compared = scene.compare(view.camera, photograph, view.correction, field_mode)
-    output = shown = compared or scene.render(view.camera, background, field_mode, maps, overdraw_half)
+        compared = scene.compare(view.camera, photograph, view.correction, field_mode, descent)
+    output = shown = compared or scene.render(view.camera, background, field_mode, maps, overdraw_half, descent)
     if view.correction is not None and isinstance(output, RenderOutput):  # the other one is corrected already
         rgb = view.shown(output.rgb, output.alpha, background)
         image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
@@ -185,10 +193,11 @@ class Training:
         """Compute `view_losses`. If a loss is not finite, the guard repairs the scene and the view is rendered again.
         Raises TrainingDiverged: the scene cannot be repaired, or the limit of rollbacks is reached."""
         while True:
-            self.texels.prepare(self.step, view, self.guard.factor)
+            descent = self.texels.prepare(self.step, view, self.guard.factor)
             diverged: TrainingDiverged | None = None
             try:
-                terms, output = view_losses(self.scene, view, self.schedule, self.step, self.watch, self.background)
+                how = (self.schedule, self.step, self.watch, self.background, descent)
+                terms, output = view_losses(self.scene, view, *how)
             except TrainingDiverged as error:
                 diverged = error
             problem = self.processes.first_error(None if diverged is None else str(diverged))

@@ -78,11 +78,12 @@ class LearningTexels:
         """Number of renders in the texel stage, over all processes."""
         return self.processes.views * self.schedule.texel_steps
 
-    def prepare(self, step: int, view: View, factor: float) -> None:
-        """Set the step size of the texels for the backward pass of this view."""
+    def prepare(self, step: int, view: View, factor: float) -> TexelDescent | None:
+        """Return the update of the texels by the backward pass of this view; with several views per step None, and
+        their gradients are scaled by the step size."""
         field = self.scene.field
         if not isinstance(field, TexelField):
-            return
+            return None
         # the loss is a mean, but a texel's step is defined by the sum
         values = count_values(view.image, view.mask, view.counted)
         rate = factor * self.schedule.texel_rate(step, self._views) * values
@@ -90,12 +91,13 @@ class LearningTexels:
             handle.remove()
         self._rates = []
         # with one view per step, its backward pass updates the colours; with several, `step` does
-        field.descent = TexelDescent(field.share, rate) if self.processes.views == 1 else None
-        if field.descent is None:
+        descent = TexelDescent(field.share, rate) if self.processes.views == 1 else None
+        if descent is None:
             self._rates.append(field.texels.register_hook(lambda gradient: gradient * rate))
         if field.alpha is not None:
             alpha_rate = self.options.alpha_rate * rate
             self._rates.append(field.alpha.register_hook(lambda gradient: gradient * alpha_rate))
+        return descent
 
     @property
     def _parameters(self) -> list[Parameter]:

@@ -50,8 +50,6 @@ def scene_of(case: SceneCase, kind: str, texture: str) -> Scene:
         texels, share = 0.2 * torch.randn(count, 3, generator=g), torch.rand(count, generator=g).double()
         alphas = 0.5 + torch.rand(count, generator=g).double() if texture == "alpha" else None
         field = TexelField(size, 1.0 + torch.rand(n, generator=g).double(), texels.double(), share, alphas)
-        if texture == "moved":
-            field.descent = TexelDescent(field.share, 0.7)
     return Scene(config, params, field)
 
 
@@ -66,8 +64,7 @@ def compared(
     """Compute the losses of a view, their gradients, texels after it and the statistics of the projection."""
     case = random_scene(30, 5, WIDTH, HEIGHT)
     scene = scene_of(case, kind, texture).to(device)
-    if texture == "moved":
-        scene.field.descent = TexelDescent(scene.field.share, 0.7)
+    descent = TexelDescent(scene.field.share, 0.7) if texture == "moved" else None
     g = torch.Generator().manual_seed(7)
     photo = torch.rand(HEIGHT, WIDTH, 3, generator=g).double().to(device)
     mask = (torch.rand(HEIGHT, WIDTH, generator=g) < 0.7).to(device) if masked else None
@@ -80,7 +77,7 @@ def compared(
     config = TrainConfig(background=background, freeze_after=0, freeze_every=2, freeze_min_updates=1)
     schedule = Schedule(config, 100)
     step = 1 if texture == "frozen" else 2
-    terms, output = view_losses(scene, View(camera, photo, mask, gains), schedule, step, LossWatch())
+    terms, output = view_losses(scene, View(camera, photo, mask, gains), schedule, step, LossWatch(), descent=descent)
     (2.0 * terms["photometric"] + 3.0 * terms["falloff"]).backward()
     assert isinstance(output, ComparedView) == ops.can_rasterize(device)
     found = {f"gradient of {name}": p.grad for name, p in scene.named_parameters() if p.grad is not None}

@@ -47,8 +47,7 @@ def texel_step(device: torch.device, most: int, alpha: bool = False) -> tuple[Ba
     share, factors = torch.rand(2, 60 * 16, generator=g, dtype=torch.float64)
     field = TexelField(size, torch.full((60,), 3.0), texels, share, 2 * factors if alpha else None)
     scene.field = field.to(device)
-    scene.field.descent = TexelDescent(scene.field.share, 0.5)
-    output = scene.render(camera, maps=True)
+    output = scene.render(camera, maps=True, descent=TexelDescent(scene.field.share, 0.5))
     weight = torch.rand(HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64).to(device)
     (output.rgb * weight).sum().backward()
     moved = {"texels": scene.field.texels.detach() - texels.to(device)}

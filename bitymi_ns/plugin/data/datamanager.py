@@ -88,8 +88,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def __init__(
         self, config: BitymiDataManagerConfig, test_mode: Literal["test", "val", "inference"] = "val", **kwargs: Any
     ) -> None:
-        # makes a training view by its index, at full size; a run replaces it by one for the size of its step
-        self.step_view: Callable[[int], View] = lambda index: self.train_views[index]
         image_files.set_up_pillow()
         check_capture(config, trains=test_mode == "val")
         with reporting_input_errors(config):
@@ -238,11 +236,9 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         (number,) = Processes.joined().view_numbers(step)
         return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, number)
 
-    def next_train(self, step: int) -> tuple[View, dict[str, Any]]:  # type: ignore[override]
-        """Return the view of a step, see `step_view`, and its batch."""
-        index = self.train_index(step)
-        view = self.step_view(index)
-        return view, {"image_idx": index, "image": view.image, "mask": view.mask}
+    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
+        """Return camera and batch of a step's training view at full size; training asks `train_index` alone."""
+        return self.train_view(self.train_index(step))
 
     @property
     def train_views(self) -> OnDemand[View]:

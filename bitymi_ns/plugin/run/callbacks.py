@@ -34,7 +34,7 @@ from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.forecast import Forecast, Steps, expected_surfels
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import OnDemand, TrainingData, View, covered_share
+from bitymi_ns.train.views import OnDemand, TrainingData, covered_share
 from bitymi_ns.trust import json_of, no_links
 
 SOON = 60  # seconds: when a run that takes less will end is not said
@@ -43,7 +43,7 @@ SOON = 60  # seconds: when a run that takes less will end is not said
 class TrainingRun:
     """Link between `Training` and nerfstudio's loop. Order of a step there:
 
-    `before` -> the data manager's `next_train` -> `losses` -> backward -> `Training.combine` -> optimisers -> `after`.
+    `before` -> `losses` -> backward -> `combine` -> optimisers -> `after`.
     """
 
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
@@ -62,7 +62,7 @@ class TrainingRun:
         data = TrainingData(views, extent, *counts, exposure_stops(facts.files), facts.files, cameras)
         optimizers, processes = attributes.optimizers.optimizers, trainer.processes
         self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
-        attributes.optimizers.before_step = self.training.combine
+        self.combine = self.training.combine
         self.capture = capture_fingerprint(dataset)
         self._random_state: Tensor | None = None
         if resume_state := model.resume_state:
@@ -100,7 +100,6 @@ class TrainingRun:
         state_training(scene, cameras, most, texels, to_come, trainer.world_size, lists)
         self.forecast = self._forecast(pixels, surfels)
         self._longest_side = max(max(camera.width, camera.height) for camera in cameras)
-        self.datamanager.step_view = self.training.view
 
     def _forecast(self, pixels: Sequence[int], surfels: Steps) -> Forecast:
         """Prepare the estimate of the run's end, from pixels of its training views and surfels of its steps."""
@@ -176,10 +175,10 @@ class TrainingRun:
         if undecided and (sentence := self.training.exposure.sentence):
             say(sentence)
 
-    def losses(self, view: View) -> dict[str, Tensor]:
-        """Compare a render of the step's view with its photograph."""
+    def losses(self, index: int) -> dict[str, Tensor]:
+        """Compare a render of training view `index`, at the step's resolution and pose, with its photograph."""
         try:
-            return self.training.losses(view)[0]
+            return self.training.losses(self.training.view(index))[0]
         except TrainingDiverged as error:
             self._diverged(error)
 

@@ -83,7 +83,7 @@ class BitymiModel(SurfelModel):
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
         self.recorded_options: str | None = None  # of a resumed run
-        self._run: TrainingRun | None = None
+        self.run: TrainingRun | None = None  # in training
         self.carry: Callable[[Camera], Camera] | None = None  # of a finished run that refined poses
 
     @property
@@ -114,18 +114,10 @@ class BitymiModel(SurfelModel):
     @property
     def seconds_left(self) -> float | None:
         """Seconds to the end of a run; None if they are not known."""
-        return None if self._run is None else self._run.forecast.left
+        return None if self.run is None else self.run.forecast.left
 
     def sizes(self) -> dict[str, float]:
         return {"surfels": float(len(self.scene))}
-
-    def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Return loss terms of a training view, or pictures of cameras."""
-        if isinstance(ray_bundle, View):
-            if self._run is None:
-                raise RuntimeError("losses exist in training only")
-            return {"losses": self._run.losses(ray_bundle)}
-        return super().get_outputs(ray_bundle)
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
@@ -152,15 +144,13 @@ class BitymiModel(SurfelModel):
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
         self.measure_time = False
-        self._run = TrainingRun(self, training_callback_attributes)
-        return self._run.callbacks()
+        self.run = TrainingRun(self, training_callback_attributes)
+        return self.run.callbacks()
 
     def get_loss_dict(
         self, outputs: dict[str, Any], batch: dict[str, Any], metrics_dict: Any = None
     ) -> dict[str, Tensor]:
-        """Return loss terms from `get_outputs`; the photometric loss of a held-out view (--steps-per-eval-batch)."""
-        if "losses" in outputs:
-            return outputs["losses"]
+        """Return the photometric loss of a held-out view (--steps-per-eval-batch)."""
         target, mask = self.photograph(batch, outputs["rgb"])
         return {"photometric": photometric(outputs["rgb"], target, self.train_config.loss.ssim_weight, mask)}
 
@@ -169,9 +159,9 @@ class BitymiModel(SurfelModel):
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
         state["train"] = messages.recorded(self.train_config)
         state["near"], state["first_surfels"] = self.scene.near, self.first_surfels
-        if self._run is not None:
-            state["trained_for"] = self._run.total
-            state["run"] = self._run.state()
+        if self.run is not None:
+            state["trained_for"] = self.run.total
+            state["run"] = self.run.state()
         elif self.trained_for is not None:
             state["trained_for"] = self.trained_for
         return state

@@ -20,6 +20,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 from torch import Tensor
+from torch.nn import Parameter
 
 from bitymi_ns import exit_messages, files
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
@@ -45,16 +46,20 @@ class _StopAfterStep(Exception):
 
 
 class TogetherOptimizers(Optimizers):
-    """nerfstudio's optimisers, one per parameter group, stepped together, which is faster."""
+    """nerfstudio's optimisers, one per parameter group, stepped together, which is faster. `combine` is called before
+    each step, once the gradients are computed, and returns the factors of `optimizers.step`."""
 
-    # called before each step, once the gradients are computed; returns the factors of `optimizers.step`
-    before_step: Callable[[], Mapping[str, Tensor]] | None = None
+    def __init__(
+        self, config: dict[str, Any], groups: dict[str, list[Parameter]], combine: Callable[[], Mapping[str, Tensor]]
+    ) -> None:
+        super().__init__(config, groups)
+        self.combine = combine
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         optimizers.forget_gradients(self.optimizers[group] for group in param_groups)
 
     def optimizer_scaler_step_some(self, grad_scaler: GradScaler, param_groups: list[str]) -> None:
-        factors = {} if self.before_step is None else self.before_step()
+        factors = self.combine()
         for group in param_groups:
             longest = self.config[group]["optimizer"].max_norm
             if longest is not None:
@@ -88,7 +93,8 @@ class BitymiTrainer(Trainer):
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._end_of_step))
 
     def setup_optimizers(self) -> Optimizers:
-        return TogetherOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
+        groups = self.pipeline.get_param_groups()
+        return TogetherOptimizers(self.config.optimizers.copy(), groups, lambda: self.pipeline.model.run.combine())
 
     def _end_of_step(self, step: int) -> None:
         self._show_step(step, self.pipeline.model.seconds_left)
@@ -150,6 +156,7 @@ class BitymiTrainer(Trainer):
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
         previous = self._catch_interrupt()
         try:
+            # nerfstudio's loop reads its number of steps there, and has no argument for it
             self.config.max_num_iterations = total - self._start_step
             with print_brackets(), step_bar(self._start_step, total) as self._show_step:
                 super().train()
@@ -214,6 +221,11 @@ class BitymiPipeline(VanillaPipeline):
         # without `world_size`, for which nerfstudio would wrap the model in DistributedDataParallel (`torchrun`)
         super().__init__(*args, **kwargs)
         self.datamanager.world_size = world_size
+
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
+        """Return no images, and the loss terms and metrics of the step's training view."""
+        losses = self.model.run.losses(self.datamanager.train_index(step))
+        return {}, losses, self.model.get_metrics_dict({}, {})
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         """Load the parameters of a checkpoint."""

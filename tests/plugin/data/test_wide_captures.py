@@ -39,9 +39,9 @@ def test_a_capture_of_both_kinds(capture: Path, capsys: pytest.CaptureFixture[st
     held_out, train = manager.eval_dataset, manager.train_dataset
     stem = Path(names[0]).stem
     assert [path.name for path in held_out.image_filenames[:6]] == [f"{stem}-{face}.png" for face in FACES]
-    assert not set(held_out.files) & set(train.files)
-    assert {path.name for path in train.files} & set(names) == {names[1]}
-    assert len(set(train.files[:6])) == 1 and train.files[6] != train.files[5]
+    assert not set(held_out.facts.files) & set(train.facts.files)
+    assert {path.name for path in train.facts.files} & set(names) == {names[1]}
+    assert len(set(train.facts.files[:6])) == 1 and train.facts.files[6] != train.facts.files[5]
     assert len(held_out) == (count + 1) // 2 + 10 and manager.eval_view(0)[1]["image"].shape == (31, 31, 3)
     poses = held_out.cameras.camera_to_worlds[:6]
     assert torch.allclose(poses[:, :, 3], poses[:1, :, 3].expand(6, 3))

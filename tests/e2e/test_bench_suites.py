@@ -8,8 +8,8 @@ import pytest
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
-from bitymi_ns.measure.bench.engine import CURVE, config_of, train_command
-from bitymi_ns.measure.bench.matrix import MethodSpec, Run, standard_scenes
+from bitymi_ns.measure.bench.engine import CURVE, train_command
+from bitymi_ns.measure.bench.matrix import CellSpec, MethodSpec, standard_scenes
 from bitymi_ns.measure.report.read import read_jsonl
 from tests.captures import colmap_model
 
@@ -26,17 +26,17 @@ def colmap_scene(room: Path, folder: Path) -> None:
     shutil.copytree(room / "images", folder / "images_2")
 
 
-def train(work: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Path:
+def train(work: Path, run: CellSpec, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Run a training command in this process; returns its config.yml."""
     monkeypatch.setattr(sys, "argv", train_command(work, run))
     ns_train.entrypoint()
-    return config_of(work, run)
+    return work / run.output / "config.yml"
 
 
 def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     colmap_scene(room, tmp_path / "360" / "bonsai")
     (scene,) = standard_scenes("mipnerf360", tmp_path / "360", ["bonsai"])
-    run = Run(scene, MethodSpec("small", "bitymi", SMALL), seed=3, steps=2)
+    run = CellSpec(scene, MethodSpec("small", "bitymi", SMALL), seed=3, steps=2)
     path = train(tmp_path / "work", run, monkeypatch)
     _, (curve,), _ = read_jsonl(path.with_name(CURVE))
     assert curve.scene == "bonsai"

@@ -4,7 +4,7 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -16,10 +16,10 @@ from bitymi_ns.measure.bench.cells import FILE, Cells
 from bitymi_ns.measure.bench.engine import run_chains
 from bitymi_ns.measure.bench.matrix import (
     BundleSpec,
+    Chain,
     Format,
-    Matrix,
     MethodSpec,
-    SceneSpec,
+    chains,
     local_scenes,
     read_plan,
     standard_scenes,
@@ -53,40 +53,36 @@ class BenchRun:
     output: Path | None = None  # Also write the table to this Markdown file.
     suite: tyro.conf.Suppress[str] = "local"
 
-    def _scenes(self) -> list[SceneSpec]:
-        if self.suite == "local":
-            if self.scenes:
-                raise BenchError("--scenes chooses scenes of a standard data set; name your captures with --data")
-            return local_scenes(self.data)
-        if len(self.data) != 1:
-            raise BenchError(f"--data is one folder: the one that holds the scenes of {self.suite}")
-        return standard_scenes(self.suite, self.data[0], self.scenes)
-
-    def matrix(self) -> Matrix:
-        """Build the matrix of these options. Raises BenchError: an option is invalid; the message says which."""
+    def chains(self) -> list[Chain]:
+        """List the cells of each run of these options. Raises BenchError: an option is invalid; the message says
+        which."""
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
-        if self.plan is None:
-            rows, bundles = [MethodSpec(name, name) for name in self.methods], None
-        else:
-            rows, bundles = read_plan(self.plan)
-        extra = tuple(shlex.split(self.extra))
+        rows, bundles = read_plan(self.plan) if self.plan else ([MethodSpec(name, name) for name in self.methods], None)
         if not rows:
             raise BenchError("nothing to run: give --methods or --plan")
-        rows = [MethodSpec(row.name, row.method, (*row.options, *extra)) for row in rows]
+        rows = [replace(row, options=(*row.options, *shlex.split(self.extra))) for row in rows]
         if bundles is None:
             bundles = [BundleSpec(name, ("--format", name)) for name in dict.fromkeys(self.formats)]
-        return Matrix(self._scenes(), rows, self.seeds, self.steps, bundles)
+        if self.suite != "local":
+            if len(self.data) != 1:
+                raise BenchError(f"--data is one folder: the one that holds the scenes of {self.suite}")
+            scenes = standard_scenes(self.suite, self.data[0], self.scenes)
+        elif self.scenes:
+            raise BenchError("--scenes chooses scenes of a standard data set; name your captures with --data")
+        else:
+            scenes = local_scenes(self.data)
+        return chains(scenes, rows, self.seeds, self.steps, bundles)
 
     def run(self) -> int:
         """Run the missing cells, print the table, and return the exit status."""
-        matrix, work = self.matrix(), Path(os.path.expanduser(self.work)).resolve()
+        runs, work = self.chains(), Path(os.path.expanduser(self.work)).resolve()
         cells = Cells(work / FILE)
         if self.output is not None:
             with write_errors_as(self.output, BenchError):
                 check_writable(self.output)
         try:
-            failures = run_chains(work, matrix.chains())
+            failures = run_chains(work, runs)
         except KeyboardInterrupt:
             finished = len(Cells(work / FILE))
             kept = f"{finished} finished cells are in {work}" if finished else "no cell was finished"
@@ -95,24 +91,23 @@ class BenchRun:
         for failure in failures:
             say(failure)
         cells.refresh()
-        text = results_page(f"Benchmark: {self.plan or self.suite}", matrix, cells, failures)
+        text = results_page(f"Benchmark: {self.plan or self.suite}", runs, cells, failures)
         print(printable(text))
         if self.output is not None:
             with write_errors_as(self.output, BenchError):
                 write_file(self.output, text.encode("utf8"), follow=True)
-        if len(cells):
-            print(printable(f"Cells: {cells.path}. A page of it: bitymi report {cells.path}"), file=sys.stderr)
-        else:
-            print("No cell was finished.", file=sys.stderr)
+        kept = (
+            f"Cells: {cells.path}. A page of it: bitymi report {cells.path}" if len(cells) else "No cell was finished."
+        )
+        print(printable(kept), file=sys.stderr)
         return FAILED if failures else 0
 
 
-def results_page(title: str, matrix: Matrix, cells: Cells, failures: Sequence[str] = ()) -> str:
-    """Format the quality tables of a matrix's finished cells as Markdown."""
-    stages = [stage for chain in matrix.chains() for stage in chain if stage.kind in ("train", "eval", "export")]
-    found = [cell for stage in stages if (cell := cells.get(stage.key)) is not None]
+def results_page(title: str, runs: Sequence[Chain], cells: Cells, failures: Sequence[str]) -> str:
+    """Format the quality tables of the finished cells of runs as Markdown."""
+    found = [found for chain in runs for cell in chain if (found := cells.get(cell.key)) is not None]
     records = Records()
     add_cells(found, cells.path, records)
     failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
-    body = quality_markdown(records.evaluations)
-    return markdown.page(title, body, [NOTES, *failed], [cell["made"]["commit"] for cell in found])
+    commits = [cell["made"]["commit"] for cell in found]
+    return markdown.page(title, quality_markdown(records.evaluations), [NOTES, *failed], commits)

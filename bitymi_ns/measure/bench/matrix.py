@@ -4,9 +4,10 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NoReturn
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -15,9 +16,8 @@ from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
-from bitymi_ns.trust import inside
-
-Kind = Literal["train", "eval", "export"]
+from bitymi_ns.ranges import describe_problems
+from bitymi_ns.safe_reading import read_text, reading
 
 
 @dataclass(frozen=True)
@@ -53,16 +53,19 @@ class BundleSpec:
 
 
 @dataclass(frozen=True)
-class Run:
-    """A training run: scene, row, seed (None: the method's own) and number of steps (None: the method's own)."""
+class CellSpec:
+    """A cell of the matrix: a training run, or an evaluation or export of its scene or of a bundle."""
 
     scene: SceneSpec
     row: MethodSpec
-    seed: int | None = None
-    steps: int | None = None
+    seed: int | None = None  # None: the method's own
+    steps: int | None = None  # length of the run; None: the method's own for this machine
+    kind: Literal["train", "eval", "export"] = "train"
+    bundle: BundleSpec | None = None
 
     @property
-    def key(self) -> dict[str, Any]:
+    def run_key(self) -> dict[str, Any]:
+        """All settings that affect the training run."""
         return {
             "suite": self.scene.suite,
             "row": self.row.name,
@@ -76,9 +79,17 @@ class Run:
         }
 
     @property
-    def name(self) -> str:
-        """Folder name, unique among the runs of a method on a capture."""
-        settings = {k: v for k, v in self.key.items() if k not in ("suite", "row")}
+    def key(self) -> dict[str, Any]:
+        """All settings that affect the result of the cell."""
+        key: dict[str, Any] = {"cell": self.kind, **self.run_key}
+        if self.bundle is not None:
+            key |= {"bundle": self.bundle.name, "export": list(self.bundle.options)}
+        return key
+
+    @property
+    def run_name(self) -> str:
+        """Folder name of the run, unique among those of a method on a capture."""
+        settings = {k: v for k, v in self.run_key.items() if k not in ("suite", "row")}
         digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
         length = "own-length" if self.steps is None else f"{self.steps}-steps"
         seed = "" if self.seed is None else f"-seed{self.seed}"
@@ -86,63 +97,62 @@ class Run:
 
     @property
     def folder(self) -> str:
-        """Path below runs/, bundles/, evals/ and logs/ of the work folder."""
-        return f"{self.scene.name}/{self.row.method}/{self.name}"
-
-    def __str__(self) -> str:
-        seed = "" if self.seed is None else f", seed {self.seed}"
-        return f"{self.scene.name}, {self.row.name}{seed}"
-
-
-@dataclass(frozen=True)
-class CellSpec:
-    """A cell of the matrix."""
-
-    run: Run
-    kind: Kind
-    bundle: BundleSpec | None = None
-
-    @property
-    def key(self) -> dict[str, Any]:
-        """All settings that affect the result of the cell."""
-        key: dict[str, Any] = {"cell": self.kind, **self.run.key}
-        if self.bundle is not None:
-            key |= {"bundle": self.bundle.name, "export": list(self.bundle.options)}
-        return key
+        """Path of the run below runs/, bundles/, evals/ and logs/ of the work folder."""
+        return f"{self.scene.name}/{self.row.method}/{self.run_name}"
 
     @property
     def form(self) -> str:
         """Name of the bundle, or `trained`."""
         return self.bundle.name if self.bundle else "trained"
 
+    @property
+    def output(self) -> Path:
+        """Path in the work folder of the output: a folder, or the file of an evaluation."""
+        if self.kind == "train":
+            return Path("runs", self.folder)
+        return Path("bundles", self.folder, self.form) if self.kind == "export" else self.pictures.with_suffix(".json")
+
+    @property
+    def pictures(self) -> Path:
+        """Path in the work folder of the pictures of an evaluation."""
+        return Path("evals", self.folder, self.form)
+
+    @property
+    def source(self) -> Path:
+        """Path in the work folder of the config.yml that is evaluated or exported."""
+        source = "train" if self.kind == "export" or self.bundle is None else "export"
+        return replace(self, kind=source).output / "config.yml"
+
+    @property
+    def run(self) -> str:
+        """Title of the run, for messages."""
+        return f"{self.scene.name}, {self.row.name}" + ("" if self.seed is None else f", seed {self.seed}")
+
     def __str__(self) -> str:
         what = {"train": "training", "eval": f"evaluation ({self.form})", "export": f"export ({self.form})"}
         return f"{self.run}: {what[self.kind]}"
 
 
-@dataclass(frozen=True)
-class Matrix:
-    """Matrix of runs: each row is trained on each scene with each seed, then baked to each bundle."""
+Chain = Sequence[CellSpec]  # the cells of one run; each may depend on those before it
 
-    scenes: Sequence[SceneSpec]
-    rows: Sequence[MethodSpec]
-    seeds: Sequence[int] = ()  # empty: once, with the method's own seed
-    steps: int | None = None  # length of a run; None: the method's own for this machine
-    bundles: Sequence[BundleSpec] = field(default_factory=tuple)
 
-    def runs(self) -> list[Run]:
-        seeds = list(self.seeds) or [None]
-        return [Run(s, r, seed, self.steps) for s in self.scenes for r in self.rows for seed in seeds]
-
-    def stages(self, run: Run) -> list[CellSpec]:
-        """List the cells of a run in the order of their dependencies."""
-        stages = [CellSpec(run, "train"), CellSpec(run, "eval")]
-        for bundle in self.bundles if run.row.ours else ():
-            stages += [CellSpec(run, "export", bundle), CellSpec(run, "eval", bundle)]
-        return stages
-
-    def chains(self) -> list[list[CellSpec]]:
-        return [self.stages(run) for run in self.runs()]
+def chains(
+    scenes: Sequence[SceneSpec],
+    rows: Sequence[MethodSpec],
+    seeds: Sequence[int] = (),
+    steps: int | None = None,
+    bundles: Sequence[BundleSpec] = (),
+) -> list[Chain]:
+    """List the cells of each run in the order of their dependencies: each row is trained on each scene with each seed
+    (empty: once, with the method's own), then baked to each bundle."""
+    found: list[Chain] = []
+    for scene, row, seed in product(scenes, rows, list(seeds) or [None]):
+        train = CellSpec(scene, row, seed, steps)
+        chain = [train, replace(train, kind="eval")]
+        for bundle in bundles if row.ours else ():
+            chain += [replace(train, kind="export", bundle=bundle), replace(train, kind="eval", bundle=bundle)]
+        found.append(chain)
+    return found
 
 
 Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atlas`
@@ -159,14 +169,15 @@ class Suite:
 
 
 def _read(path: Path) -> Any:
-    try:
-        return yaml.safe_load(path.read_text("utf8"))
-    except OSError as error:
-        raise BenchError(f"{path} cannot be read: {error.strerror or error}") from error
-    except RecursionError as error:
-        raise BenchError(f"{path} is nested too deeply") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise BenchError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
+    with reading(path, _refuse):
+        try:
+            return yaml.safe_load(read_text(path))
+        except yaml.YAMLError as error:
+            raise ValueError(" ".join(str(error).split())) from error
+
+
+def _refuse(message: str, cause: BaseException) -> NoReturn:
+    raise BenchError(message) from cause
 
 
 def suites() -> dict[str, Suite]:
@@ -220,18 +231,19 @@ def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[Sce
 
 
 Words = list[str | int | float]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")]
 
 
 class _PlanRow(BaseModel):
     model_config = ConfigDict(extra="forbid")
-    method: str
+    method: Name
     options: Words = []
 
 
 class _Plan(BaseModel):
     model_config = ConfigDict(extra="forbid")
     rows: Annotated[dict[str | int | float, _PlanRow], Field(min_length=1)]
-    bundles: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")], Words] | None = None
+    bundles: dict[Name, Words] | None = None
 
 
 def read_plan(name: str) -> tuple[list[MethodSpec], list[BundleSpec] | None]:
@@ -247,19 +259,11 @@ def read_plan(name: str) -> tuple[list[MethodSpec], list[BundleSpec] | None]:
     try:
         plan = _Plan.model_validate(entry)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ", ".join(map(str, first["loc"]))
         raise BenchError(
-            f"plan {name}: {where or 'the file'}: {first['msg']}; a plan has rows, NAME: {{method: NAME, "
-            "options: [...]}}, and optionally bundles, NAME: [options of ns-export bitymi-atlas]"
+            f"plan {name}: {describe_problems(error)}; a plan has rows, NAME: {{method: NAME, options: [...]}}, and "
+            "optionally bundles, NAME: [options of ns-export bitymi-atlas]"
         ) from error
-    rows = []
-    for title, row in plan.rows.items():
-        try:
-            inside(Path("runs"), row.method)
-        except ValueError as error:
-            raise BenchError(f"plan {name}, row {title}: {error}") from error
-        rows.append(MethodSpec(str(title), row.method, tuple(map(str, row.options))))
+    rows = [MethodSpec(str(title), row.method, tuple(map(str, row.options))) for title, row in plan.rows.items()]
     if plan.bundles is None:
         return rows, None
     return rows, [BundleSpec(title, tuple(map(str, options))) for title, options in plan.bundles.items()]

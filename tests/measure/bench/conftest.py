@@ -12,7 +12,7 @@ import pytest
 from bitymi_ns.bundle import World
 from bitymi_ns.bundle.manifest import describe, dump
 from bitymi_ns.codec.quantise import Format
-from bitymi_ns.measure.bench.matrix import BundleSpec, Matrix, MethodSpec, SceneSpec
+from bitymi_ns.measure.bench.matrix import BundleSpec, Chain, MethodSpec, SceneSpec, chains
 
 FAKE = """#!{python} -SE
 import json, os, pathlib, sys, time
@@ -136,8 +136,8 @@ def capture(tmp_path: Path) -> Callable[[str], Path]:
 
 
 @pytest.fixture
-def matrix(capture: Callable[[str], Path]) -> Matrix:
+def matrix(capture: Callable[[str], Path]) -> list[Chain]:
     """Two captures, two seeds, one format: 16 cells."""
     scenes = [SceneSpec(name, capture(name)) for name in ("fox", "lego")]
     bundles = [BundleSpec("bc7", ("--format", "bc7"))]
-    return Matrix(scenes, [MethodSpec("bitymi", "bitymi")], (0, 1), 100, bundles)
+    return chains(scenes, [MethodSpec("bitymi", "bitymi")], (0, 1), 100, bundles)

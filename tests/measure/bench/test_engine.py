@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from bitymi_ns.locks import Lock
 from bitymi_ns.measure.bench import engine
 from bitymi_ns.measure.bench.cells import Cells, identity
 from bitymi_ns.measure.bench.engine import run_chains
-from bitymi_ns.measure.bench.matrix import CellSpec, Matrix, MethodSpec
+from bitymi_ns.measure.bench.matrix import BundleSpec, Chain, MethodSpec, chains
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, tool
 
 
@@ -21,9 +22,9 @@ def lines(work: Path) -> list[dict]:
     return [json.loads(line) for line in (work / "cells.jsonl").read_text().splitlines()]
 
 
-def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matrix, tmp_path: Path) -> None:
+def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: list[Chain], tmp_path: Path) -> None:
     work = tmp_path / "work"
-    assert run_chains(work, matrix.chains()) == []
+    assert run_chains(work, matrix) == []
     cells = lines(work)
     assert len(cells) == 16 and len({identity(c["key"]) for c in cells}) == 16
     assert [c["key"]["cell"] for c in cells[:4]] == ["train", "eval", "export", "eval"]
@@ -39,8 +40,8 @@ def test_every_cell_is_a_line_with_its_settings_and_figures(fakes, matrix: Matri
     assert "passive" in next(log).read_text()
 
 
-def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    run_chains(tmp_path / "work", matrix.chains()[1:2])
+def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: list[Chain], tmp_path: Path) -> None:
+    run_chains(tmp_path / "work", matrix[1:2])
     train, trained, export, baked = fakes.calls()
     assert train.startswith("ns-train bitymi ") and train.endswith("captures/fox")
     for words in ("--machine.seed 1", "--pipeline.model.train.seed 1", "--max-num-iterations 100", "--vis none"):
@@ -49,17 +50,19 @@ def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: Matrix, tm
     assert trained.startswith("ns-eval --load-config ") and "/bundles/" in baked
 
 
-def test_finished_cells_are_skipped(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    run_chains(tmp_path / "work", matrix.chains())
+def test_finished_cells_are_skipped(fakes, matrix: list[Chain], tmp_path: Path) -> None:
+    run_chains(tmp_path / "work", matrix)
     fakes.calls()
-    renamed = Matrix(matrix.scenes, [MethodSpec("another name", "bitymi")], (0, 1), 100, matrix.bundles)
-    assert run_chains(tmp_path / "work", matrix.chains()) == run_chains(tmp_path / "work", renamed.chains()) == []
+    renamed = [[replace(cell, row=MethodSpec("another name", "bitymi")) for cell in chain] for chain in matrix]
+    assert run_chains(tmp_path / "work", matrix) == run_chains(tmp_path / "work", renamed) == []
     assert fakes.calls() == []
 
 
 @pytest.mark.parametrize("at", [0, 2, 3])
-def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int) -> None:
-    work, chain = tmp_path / "work", matrix.chains()[0]
+def test_a_kill_costs_one_cell(
+    fakes, matrix: list[Chain], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
+) -> None:
+    work, chain = tmp_path / "work", matrix[0]
     calls = iter(range(99))
 
     def killed(command: list[str], log: Path, lock: Lock) -> object:
@@ -82,10 +85,10 @@ def test_a_kill_costs_one_cell(fakes, matrix: Matrix, tmp_path: Path, monkeypatc
 
 @pytest.mark.slow
 def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
-    fakes, matrix: Matrix, capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fakes, matrix: list[Chain], capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work, python = tmp_path / "work", fakes.python(monkeypatch)
-    words = [python, "-m", "bitymi_ns", "bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10"]
+    words = [python, "-m", "bitymi_ns", "bench", "local", "--data", str(matrix[0][0].scene.data), "--steps", "10"]
     words += ["--formats", "bc7", "--work", str(work)]
     fakes.slow.write_text("ns-export")
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -107,8 +110,8 @@ def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
     assert [call.split()[0] for call in fakes.calls()] == ["ns-export", "ns-eval"] and len(lines(work)) == 4
 
 
-def test_a_line_that_was_cut_off_is_that_cell_alone(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    work, chain = tmp_path / "work", matrix.chains()[0]
+def test_a_line_that_was_cut_off_is_that_cell_alone(fakes, matrix: list[Chain], tmp_path: Path) -> None:
+    work, chain = tmp_path / "work", matrix[0]
     run_chains(work, [chain])
     fakes.calls()
     text = (work / "cells.jsonl").read_text()
@@ -118,8 +121,8 @@ def test_a_line_that_was_cut_off_is_that_cell_alone(fakes, matrix: Matrix, tmp_p
     assert [identity(c["key"]) for c in lines(work)] == [identity(s.key) for s in chain]
 
 
-def test_a_training_that_is_done_again_takes_its_cells_with_it(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    work, chain = tmp_path / "work", matrix.chains()[0]
+def test_a_training_that_is_done_again_takes_its_cells_with_it(fakes, matrix: list[Chain], tmp_path: Path) -> None:
+    work, chain = tmp_path / "work", matrix[0]
     run_chains(work, [chain])
     fakes.calls()
     text = (work / "cells.jsonl").read_text().splitlines(keepends=True)
@@ -131,10 +134,10 @@ def test_a_training_that_is_done_again_takes_its_cells_with_it(fakes, matrix: Ma
     assert [call.split()[0] for call in fakes.calls()] == ["ns-export", "ns-eval"]
 
 
-def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: Matrix, tmp_path: Path) -> None:
+def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: list[Chain], tmp_path: Path) -> None:
     work = tmp_path / "work"
     fakes.fail("ns-train captures/fox", "ns-export /lego/ -seed1")
-    failures = run_chains(work, matrix.chains())
+    failures = run_chains(work, matrix)
     assert len(failures) == 3
     assert "fox, bitymi, seed 0: training failed" in failures[0] and "status 3" in failures[0]
     assert "something is wrong with the capture" in failures[0]
@@ -142,19 +145,19 @@ def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: Matrix, tmp_path:
     assert len(lines(work)) == 4 + 2  # the second lego run has no export and no evaluation of it
     fakes.fail()
     fakes.calls()
-    assert run_chains(work, matrix.chains()) == []
+    assert run_chains(work, matrix) == []
     assert len(fakes.calls()) == 8 + 2
 
 
-def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: Matrix, tmp_path: Path) -> None:
+def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: list[Chain], tmp_path: Path) -> None:
     (fakes.folder / "ns-eval").write_text("#!/bin/sh\nexit 0\n")
-    (failure, *_) = run_chains(tmp_path / "work", matrix.chains()[:1])
+    (failure, *_) = run_chains(tmp_path / "work", matrix[:1])
     assert "evaluation (trained)" in failure and "no figures" in failure
 
 
-def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: Matrix, tmp_path: Path) -> None:
-    other = Matrix(matrix.scenes[:1], [MethodSpec("splatfacto", "splatfacto")], (), 100, matrix.bundles)
-    assert run_chains(tmp_path / "work", other.chains()) == []
+def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: list[Chain], tmp_path: Path) -> None:
+    other = chains([matrix[0][0].scene], [MethodSpec("splatfacto", "splatfacto")], (), 100, [BundleSpec("bc7", ())])
+    assert run_chains(tmp_path / "work", other) == []
     assert [call.split()[0] for call in fakes.calls()] == ["ns-train", "ns-eval"]
     (cell, _) = lines(tmp_path / "work")
     assert "seconds" not in cell["value"] and cell["value"]["process_seconds"] >= 0
@@ -189,16 +192,24 @@ def test_empty_matrix_and_missing_tools(tmp_path: Path, monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("option", ["--work", "--output"])
 def test_places_that_cannot_be_written_are_found_first(
-    fakes, matrix: Matrix, tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+    fakes, matrix: list[Chain], tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
 ) -> None:
     (tmp_path / "file").write_text("")
-    words = ["bench", "local", "--data", str(matrix.scenes[0].data), "--steps", "10", "--work", str(tmp_path / "work")]
+    words = [
+        "bench",
+        "local",
+        "--data",
+        str(matrix[0][0].scene.data),
+        "--steps",
+        "10",
+        "--work",
+        str(tmp_path / "work"),
+    ]
     assert main([*words, option, str(tmp_path / "file" / "x")]) == 1
     assert f"x cannot be written: {tmp_path / 'file'} is not a folder" in capsys.readouterr().err
     assert fakes.calls() == []
 
 
-def test_runs_of_different_settings_have_different_folders(matrix: Matrix) -> None:
-    runs = matrix.runs()
-    assert len({run.folder for run in runs}) == 4
-    assert Cells(Path("/nowhere/cells.jsonl")).get(CellSpec(runs[0], "train").key) is None
+def test_runs_of_different_settings_have_different_folders(matrix: list[Chain]) -> None:
+    assert len({chain[0].folder for chain in matrix}) == 4
+    assert Cells(Path("/nowhere/cells.jsonl")).get(matrix[0][0].key) is None

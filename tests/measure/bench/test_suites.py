@@ -90,17 +90,17 @@ def test_a_plan_of_ones_own(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("rows: [", "is not valid YAML"),
-        ("rows: {}", "rows: Dictionary should have at least 1 item"),
-        ("rows: {a: bitymi}", r"rows, a: .*a plan has rows, NAME: \{method: NAME"),
-        ("rows: {a: {method: bitymi, option: []}}", "rows, a, option: Extra"),
-        ("rows: {a: {method: bitymi, options: --x}}", "rows, a, options: .*valid list"),
-        ("rows: {a: {method: ../x}}", "row a: "),
-        ("rows: {a: {method: bitymi}}\nbundle: {}", "bundle: Extra"),
-        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "bundles, ../x"),
-        ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "bundles: .*valid dictionary"),
-        ("3", "the file: "),
-        ("[" * 5000, "plan.yaml is nested too deeply"),
+        ("rows: [", "plan.yaml cannot be read: .* line 1, column 8"),
+        ("rows: {}", "rows must have at least 1 item"),
+        ("rows: {a: bitymi}", r"rows.a must be .*a plan has rows, NAME: \{method: NAME"),
+        ("rows: {a: {method: bitymi, option: []}}", "rows.a.option Extra"),
+        ("rows: {a: {method: bitymi, options: --x}}", "rows.a.options must be a valid list"),
+        ("rows: {a: {method: ../x}}", "rows.a.method must match"),
+        ("rows: {a: {method: bitymi}}\nbundle: {}", "bundle Extra"),
+        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "bundles.'../x'"),
+        ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "bundles must be a valid dictionary"),
+        ("3", "plan.yaml: must be a valid dictionary"),
+        ("[" * 5000, "plan.yaml cannot be read: it is nested too deeply"),
     ],
 )
 def test_a_malformed_plan_says_where(tmp_path: Path, text: str, reason: str) -> None:

@@ -4,9 +4,11 @@ import functools
 import importlib.metadata
 import os
 import platform
-import shutil
 import subprocess
+from contextlib import suppress
 from pathlib import Path
+
+import psutil
 
 
 def output(command: list[str], where: Path | None = None) -> str:
@@ -27,26 +29,12 @@ def commit() -> str:
     return output(["git", "describe", "--always", "--dirty=+", "--exclude=*"], where)
 
 
-def cores() -> int:
-    """Count the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def gpus() -> list[str]:
-    """List the names of the NVIDIA GPUs, as the driver reports them."""
-    if shutil.which("nvidia-smi") is None:
-        return []
-    return output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
-
-
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that affect results."""
     found = {"python": platform.python_version()}
     for name in ("bitymi-ns", "torch", "nerfstudio"):
-        try:
+        with suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return found
 
 
@@ -63,17 +51,10 @@ def processor() -> str:
 @functools.cache
 def machine() -> str:
     """Describe the machine in one line: processor, cores, memory, GPUs, and the limit on threads."""
-    memory = ""
-    try:
-        memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB"
-    except (OSError, ValueError):
-        pass
-    names = gpus()
-    cards = f", {len(names)} x {names[0]}" if names else ""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    memory = psutil.virtual_memory().total / 2**30
+    cards = output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
+    gpus = f", {len(cards)} x {cards[0]}" if cards else ""
     threads = os.environ.get("OMP_NUM_THREADS")
     limit = f", OMP_NUM_THREADS={threads}" if threads else ""
-    return f"{processor()}, {cores()} cores{memory}{cards}{limit}"
-
-
-def software() -> str:
-    return ", ".join(f"{name} {version}" for name, version in versions().items())
+    return f"{processor()}, {cores} cores, {memory:.0f} GiB{gpus}{limit}"

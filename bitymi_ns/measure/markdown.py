@@ -11,7 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
-from bitymi_ns.measure.machine import commit, machine, software
+from bitymi_ns.measure.machine import commit, machine, versions
 
 
 def escaped(text: str) -> str:
@@ -32,17 +32,14 @@ def number(value: float | None, digits: int = 2) -> str:
     return "" if value is None else f"{value:,.{digits}f}"
 
 
-def _command_line() -> str:
-    program = os.path.basename(sys.argv[0])
-    start = ["python", os.path.relpath(sys.argv[0])] if program.endswith(".py") else [program]
-    return shlex.join([*start, *sys.argv[1:]])
-
-
 def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str] = ()) -> str:
     """Format a section: title, command line, machine and commit, body, notes. `commits`: at which the figures were
     measured; empty: that of this checkout."""
     measured = sorted(set(commits)) or [commit()]
-    lines = [f"## {title}", "", f"`{_command_line()}`  ", f"{machine()}; {software()}  "]
+    script = sys.argv[0].endswith(".py")
+    program = ["python", os.path.relpath(sys.argv[0])] if script else [os.path.basename(sys.argv[0])]
+    software = ", ".join(f"{name} {version}" for name, version in versions().items())
+    lines = [f"## {title}", "", f"`{shlex.join([*program, *sys.argv[1:]])}`  ", f"{machine()}; {software}  "]
     lines += [f"{datetime.date.today():%Y-%m-%d}, commit {', '.join(c or 'unknown' for c in measured)}", "", body]
     if notes:
         lines += ["", *(f"- {note}" for note in notes)]

@@ -42,8 +42,6 @@ class ModelImage(NamedTuple):
 
 
 class Model(NamedTuple):
-    """COLMAP model."""
-
     cameras: dict[int, ColmapCamera]  # by number
     images: list[ModelImage]  # sorted by name
     xyz: npt.NDArray[np.float64]  # [N, 3] float64 points

@@ -56,7 +56,6 @@ class Source:
         return [path or finder.missing(name) for path, name in zip(finder.find_all(names), names, strict=True)]
 
     def describe(self) -> str:
-        """Describe the source in a line."""
         model = self.model
         used = {image.camera_id for image in model.images}
         kinds = Counter(model.cameras[number].model for number in used)

@@ -60,7 +60,7 @@ def kind_of(path: Path, rows: Iterable[Kind], beside: Collection[str] = ()) -> K
                 name = next(filter(None, found.groups()), "")
                 whose = [each.replace("NAME", name) for each in row.of.split()]
                 there = any(each in beside or ("*" in each and fnmatch.filter(beside, each)) for each in whose)
-                if (there or not whose) and (not row.mark or holds(path, row.mark, MOST_TEXT)):
+                if (there or not whose) and (not row.mark or holds(path, row.mark.encode(), MOST_TEXT)):
                     return row
     return None
 

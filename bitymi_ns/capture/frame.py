@@ -40,7 +40,6 @@ class WorldFrame:
 
 
 def write_frame(folder: Path, frame: WorldFrame) -> None:
-    """Write frame.json."""
     write_file(folder / FILE, (json.dumps(asdict(frame), indent=2) + "\n").encode())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -270,14 +271,9 @@ def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Bisect for the largest number in [0, 1] that fits; all smaller ones fit."""
-    if fits(1.0):
-        return 1.0
-    low, high = 0.0, 1.0
-    for _ in range(24):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if fits(middle) else (low, middle)
-    return low
+    """Bisect for the largest number in [0, 1] that fits, to 24 bits; all smaller ones fit."""
+    parts = 1 << 24
+    return bisect_left(range(1, parts + 1), True, key=lambda part: not fits(part / parts)) / parts
 
 
 @lru_cache(maxsize=CACHED_MAPS)

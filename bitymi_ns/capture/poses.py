@@ -250,7 +250,6 @@ def by_camera(photos: Sequence[Photo]) -> list[list[Photo]]:
 
 
 def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions) -> CameraGroup:
-    """Make the initial camera of these photographs."""
     width, height = photos[0].width, photos[0].height
     if photos[0].panorama:
         return CameraGroup(ColmapCamera(SPHERICAL_MODEL, width, height, (float(width), float(height))), True, names)

@@ -166,7 +166,7 @@ class _Reader:
             warn(f"{found.folder} holds poses that are not read: {named}. Poses are computed from the photographs.")
         readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
         capture = {**readers, "blender": self._blender}.get(found.format, self._transforms)()
-        capture.poses_as = self.poses_as
+        capture.downscale, capture.poses_as = self.downscale, self.poses_as
         if capture.report is None and read_frame(found.folder) is not None:
             capture.report = found.folder
         there = [name for name in ("val", "test") if capture.parts.get(name)]
@@ -232,9 +232,8 @@ class _Reader:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
         scale = float(meta.get("applied_scale", 1.0))
         points = self._points(own, photographs, source)
-        return Capture(
-            found.format, source, photographs, points, frame, read.lists, {}, self.downscale, applied, scale, boxed
-        )
+        of_file = {"applied": applied, "applied_scale": scale, "declares_box": boxed}
+        return Capture(found.format, source, photographs, points, frame, read.lists, **of_file)
 
     def _colmap(self) -> Capture:
         """Read a COLMAP model, and the lists of names beside it."""
@@ -251,10 +250,8 @@ class _Reader:
             own = self._colored(own, model.without_colors, photographs, source.folder)
         points = self._points(own, photographs, where)
         lists = read_split_lists(found.folder, source.folder, [each.file for each in photographs])
-        return Capture(
-            found.format, where, photographs, points, options, lists, {}, self.downscale, TO_Z_UP,
-            report=source.report, model=None if source.origin is None else source,
-        )  # fmt: skip
+        sfm = {"report": source.report, "model": None if source.origin is None else source}
+        return Capture(found.format, where, photographs, points, options, lists, applied=TO_Z_UP, **sfm)
 
     def _scanned(self) -> Capture:
         found = self.found
@@ -265,7 +262,7 @@ class _Reader:
         points = self._points(None, photographs, source)
         files = [each.file for each in photographs] if found.format == "pose-files" else []
         lists = lists_by_name(files, NSVF, "NSVF's names")
-        return Capture(found.format, source, photographs, points, self.options, lists, downscale=self.downscale)
+        return Capture(found.format, source, photographs, points, self.options, lists)
 
     def _blender(self) -> Capture:
         """Read a Blender data set with its own split. If one of the val and test files is missing, or lacks all its
@@ -294,7 +291,7 @@ class _Reader:
         if options.scale_factor == 1.0:  # else the user has chosen it
             frame = fit_scale(frame, used, source)
         points = self._points(None, used, source)
-        return Capture(found.format, source, every, points, frame, parts=numbers, downscale=self.downscale)
+        return Capture(found.format, source, every, points, frame, parts=numbers)
 
     def _checked(
         self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None], source: str

@@ -30,8 +30,6 @@ INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 
 @dataclass(frozen=True)
 class Found:
-    """Recognized capture."""
-
     format: Format  # to read it as
     path: Path
     """nerfstudio, instant-ngp: transforms.json; blender, photographs: the folder; colmap: that of the model; video: the

@@ -47,8 +47,6 @@ POLE = 0.35  # largest standard deviation of the first and last row, the sphere'
 
 @dataclass(frozen=True)
 class Photo:
-    """A readable photograph."""
-
     name: str  # path relative to the folder, with slashes
     path: Path
     width: int  # upright, as the height

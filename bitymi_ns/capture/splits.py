@@ -47,7 +47,6 @@ class Split(NamedTuple):
     rule: str
 
     def describe(self, names: Sequence[Path]) -> str:
-        """Describe the split in a line."""
         if not self.held_out:
             return f"All {len(self.train)} photographs are trained on: none is held out for evaluation."
         if self.rule == "all":
@@ -171,9 +170,7 @@ Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
 
 def duplicates(train: Sequence[Any], held_out: Sequence[Any]) -> list[Pair]:
     """Pair held-out items with the first equal training item; None equals nothing."""
-    first: dict[Any, int] = {}
-    for i, content in enumerate(train):
-        first.setdefault(content, i)
+    first = {content: i for i, content in reversed([*enumerate(train)])}
     return [(first[content], j) for j, content in enumerate(held_out) if content is not None and content in first]
 
 

@@ -56,8 +56,6 @@ UNKNOWN_SIZE = 800  # pixels along the sides of missing pictures of unstated siz
 
 @dataclass(frozen=True)
 class Transforms:
-    """JSON file of a capture."""
-
     path: Path
     meta: dict[str, Any]  # content
     photographs: list[Photograph]  # sorted by file name

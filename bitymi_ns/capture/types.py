@@ -34,7 +34,6 @@ say, warn = _log.info, _log.warning  # report what is read, and what is missing,
 
 
 def fail(message: str, cause: BaseException | None = None) -> NoReturn:
-    """Raise CaptureError(message) from `cause`."""
     raise CaptureError(message) from cause
 
 
@@ -77,7 +76,6 @@ class ColmapCamera(NamedTuple):
 
     @property
     def colmap(self) -> "pycolmap.Camera":
-        """pycolmap's camera."""
         from bitymi_ns.capture import pycolmap  # slow, and not needed for options
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
@@ -100,8 +98,6 @@ class ColmapCamera(NamedTuple):
 
 @dataclass(frozen=True)
 class Photograph:
-    """A photograph with its camera."""
-
     file: Path
     camera: ColmapCamera  # in pixels before downscaling
     pose: Pose  # [4, 4] float64, camera to world, OpenGL axes (camera: x right, y up, z backward)
@@ -163,8 +159,6 @@ class SfmOptions(SfmSettings):
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """Camera poses of a capture."""
-
     model: Path
     """Folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in full-size pixels of `images`, distorted as
     they are. frame.json in `report` states its up and metres, as far as they are known."""

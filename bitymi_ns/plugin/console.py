@@ -32,7 +32,6 @@ def step_bar(done: int, total: int) -> Iterator[Callable[[int, float | None], No
 
 
 def duration(seconds: float) -> str:
-    """Describe a length of time."""
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
@@ -50,7 +49,6 @@ class InputError(SystemExit):
 
 
 def fail(message: str, cause: BaseException | None = None) -> NoReturn:
-    """Raise InputError(message) from `cause`."""
     raise InputError(message) from cause
 
 
@@ -60,7 +58,6 @@ def say(message: str) -> None:
 
 
 def warn(message: str) -> None:
-    """Print a warning."""
     CONSOLE.print(f"[bold yellow]{escape(printable(message))}", soft_wrap=True)
 
 

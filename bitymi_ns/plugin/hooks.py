@@ -220,7 +220,6 @@ def _running_command() -> tuple[Any, dict[str, Any]] | None:
 
 
 def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
-    """Find the bundle whose config.yml is being loaded."""
     candidates = [] if evaluated is None else [evaluated]
     _, given = _given_config()
     candidates += [recorded] if given is None else [given.parent, recorded]

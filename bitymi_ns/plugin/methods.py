@@ -61,7 +61,6 @@ def _warn(lost: str, error: Exception) -> None:
 
 
 def _exports() -> list[Any]:
-    """List the commands for ns-export."""
     import tyro
 
     from bitymi_ns.plugin.export.command import ExportAtlas

@@ -79,7 +79,7 @@ def test_results(tmp_path: Path, row: Kind, name: str, whose: str) -> None:
         (folder / name).mkdir()
     else:
         assert find_photos(tmp_path)
-        (folder / name).write_bytes(row.mark)
+        (folder / name).write_bytes(row.mark.encode())
     assert not find_photos(tmp_path) and passed_over(tmp_path)[0].startswith(f"test ({row.what}: 1")
 
 
@@ -100,7 +100,7 @@ def test_poses_of_other_programs(tmp_path: Path, row: Kind, name: str, whose: st
     if row.mark:
         place.touch()
         assert not poses_in(tmp_path)
-    place.write_bytes(b"..." + row.mark)
+    place.write_bytes(b"..." + row.mark.encode())
     (found,) = poses_in(tmp_path)
     assert found.startswith(f"{below}{name.upper()} ({row.what}")
     assert not {"FILE", "IMAGES", "FOLDER"} & {*found.replace("'", " ").split()}

@@ -89,7 +89,6 @@ def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[
 
 
 def why_none(job: Job, graph: ViewGraph) -> NoPoses:
-    """Explain why there is no model."""
     count = len(job.order)
     bare = sum(features < FEW_FEATURES for features in graph.features.values())
     if bare > count / 2:

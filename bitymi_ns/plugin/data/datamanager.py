@@ -122,10 +122,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         path = Path(super().get_datapath())
         return path.parent if isinstance(self.config.dataparser, BundleCamerasConfig) else path
 
-    @property
-    def dataset_type(self) -> type[BitymiDataset]:  # type: ignore[override]
-        return BitymiDataset
-
     def sample_train_cameras(self) -> list[int]:
         """Return the training views for nerfstudio's base class; `train_index` orders them."""
         if len(self.train_dataset) == 0:

@@ -81,7 +81,6 @@ class BitymiDataParser(DataParser):
         self.downscale_factor: int | None = None  # set by nerfstudio if photographs are not needed: none is opened then
 
     @cached_property
-    @as_input_error()
     def capture(self) -> Capture:
         """The capture; read once."""
         return read_capture(self.config, self.downscale_factor is None, self.points)

@@ -1,9 +1,9 @@
 """Dataset of a capture: undistorted images with alpha and masks, cached in memory within a budget."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -23,7 +23,7 @@ from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.plugin.data.facts import CaptureFacts
 from bitymi_ns.plugin.data.views import MOVED, select_views
-from bitymi_ns.train.views import MemoryBudget, over_background, resample_nearest
+from bitymi_ns.train.views import MemoryBudget, OnDemand, over_background, resample_nearest
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the images of a capture in a run on the CPU, where a step takes far longer than reading one."""
@@ -76,14 +76,6 @@ class BitymiDataset(InputDataset):
             self.get_numpy_image(image_idx)
         return self._summaries[image_idx]
 
-    def get_image_float32(self, image_idx: int) -> Tensor:
-        """Read an image [H, W, 3 or 4] in [0, 1], alpha not composed."""
-        return torch.from_numpy(self.get_numpy_image(image_idx)).float() / 255.0
-
-    def get_image_uint8(self, image_idx: int) -> Tensor:
-        """Read an image [H, W, 3 or 4], alpha not composed."""
-        return torch.from_numpy(self.get_numpy_image(image_idx))
-
     def __getitem__(self, image_idx: int) -> dict[str, Any]:
         """Return the batch for viewer and ns-render, which need composed alpha."""
         data = self.get_data(image_idx)
@@ -93,10 +85,12 @@ class BitymiDataset(InputDataset):
 
     @as_input_error()
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """Read an image, its mask [H, W, 1] bool if any, and in training its depth [H, W] in units of the scene and
-        normal [H, W, 3], both float16, if they are used."""
-        read = self.get_image_float32 if image_type == "float32" else self.get_image_uint8
-        data: dict[str, Any] = {"image_idx": image_idx, "image": read(image_idx)}
+        """Read an image [H, W, 3 or 4], alpha not composed, its mask [H, W, 1] bool if any, and in training its depth
+        [H, W] in units of the scene and normal [H, W, 3], both float16, if they are used."""
+        image = torch.from_numpy(self.get_numpy_image(image_idx))
+        data: dict[str, Any] = {"image_idx": image_idx, "image": image}
+        if image_type == "float32":
+            data["image"] = image.float() / 255.0
         masks = self._dataparser_outputs.mask_filenames
         if masks is not None or not (self.facts.lost or self.facts.lenses[image_idx].whole):
             mask = view_mask(self._dataparser_outputs, image_idx)
@@ -137,33 +131,24 @@ def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:
     return lens.undistort_mask(None if path is None else checked_mask(path), path)
 
 
-class CachedImages(Sequence):
+class CachedImages(OnDemand[dict[str, Any]]):
     """Batches of a dataset (image, mask, metadata), kept within the budget, which datasets share, and read at every use
     beyond it. Reads all at the start, to notice unreadable ones."""
 
     def __init__(
         self, dataset: BitymiDataset, image_type: Literal["uint8", "float32"], budget: MemoryBudget, description: str
     ) -> None:
-        self._dataset, self._image_type = dataset, image_type
-        self._read_recently = lru_cache(maxsize=RECENT)(self._read)
+        read = partial(dataset.get_data, image_type=image_type)
+        read_recently = lru_cache(maxsize=RECENT)(read)
         self._kept: dict[int, dict[str, Any]] = {}
+        super().__init__(len(dataset), lambda index: self._kept.get(index) or read_recently(index))
         starts = range(0, len(dataset), PREFETCH)
         with ThreadPoolExecutor(max_workers=2) as readers:
             for start in track(starts, description, transient=True):
                 indices = range(len(dataset))[start : start + PREFETCH]
-                for index, batch in zip(indices, list(readers.map(self._read, indices)), strict=True):
+                for index, batch in zip(indices, list(readers.map(read, indices)), strict=True):
                     if budget.reserve(sum(value.nbytes for value in batch.values() if isinstance(value, Tensor))):
                         self._kept[index] = batch
-
-    def __len__(self) -> int:
-        return len(self._dataset)
-
-    def __getitem__(self, index: int) -> dict[str, Any]:  # type: ignore[override]
-        index = range(len(self))[index]
-        return self._kept[index] if index in self._kept else self._read_recently(index)
-
-    def _read(self, index: int) -> dict[str, Any]:
-        return self._dataset.get_data(index, image_type=self._image_type)
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
@@ -193,8 +178,11 @@ def capture_fingerprint(dataset: BitymiDataset) -> dict[str, Any]:
     return {"views": len(dataset), **{name: hashlib.sha256(data).hexdigest() for name, data in digests.items()}}
 
 
-def warn_of_other_capture(before: Mapping[str, Any], now: Mapping[str, Any]) -> None:
-    """Warn if a run that is resumed, measured or exported reads another capture, by fingerprints."""
+def warn_of_other_capture(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> None:
+    """Warn if a run that is resumed, measured or exported reads another capture, by fingerprints; checkpoints of
+    earlier versions have none."""
+    if before is None:
+        return
     if before["views"] != now["views"]:
         what = f"it had {before['views']} training photographs, this one has {now['views']}"
     elif before["names"] != now["names"]:

@@ -14,7 +14,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from bitymi_ns.capture.depth_normal_maps import Values, read_depth, read_normal
 from bitymi_ns.capture.image_files import in_threads, read_image
-from bitymi_ns.capture.lens import Lens, Pinhole
+from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.points import GREY
 from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.plugin.data.facts import KEY, CaptureFacts, DepthFit, FittedMaps
@@ -46,10 +46,6 @@ class _Seen(NamedTuple):
     lens: Lens
     center: Floats
     rotation: Floats
-
-    @property
-    def camera(self) -> Pinhole:
-        return self.lens.pinhole
 
     def fitted(self, fit: DepthFit) -> _Seen:
         """Replace the map's values by camera z in units of the scene."""
@@ -88,7 +84,6 @@ def with_depth(
 
 
 def _read_maps(outputs: DataparserOutputs, facts: CaptureFacts, rows: Sequence[int], unit: float | None) -> list[_Seen]:
-    """Read depth of views at small size."""
     lenses, maps = facts.lenses, facts.maps
     small = {
         lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
@@ -103,7 +98,6 @@ def _read_maps(outputs: DataparserOutputs, facts: CaptureFacts, rows: Sequence[i
 
 
 def _check_normals(facts: CaptureFacts) -> None:
-    """Warn of normals in another frame than the camera's."""
     rows = [i for i, files in enumerate(facts.maps) if files.normal is not None]
     for i in [rows[k] for k in spread(len(rows), 8)]:
         lens, files = facts.lenses[i], facts.maps[i]
@@ -120,7 +114,7 @@ def _check_normals(facts: CaptureFacts) -> None:
 
 def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, npt.NDArray[np.bool_]]:
     """Project points [N, 3]: pixel (flat index), camera z, and whether they are in the picture."""
-    to = view.camera
+    to = view.lens.pinhole
     local = (xyz - view.center) @ view.rotation
     front = local[:, 2] > 0.0
     z = np.where(front, local[:, 2], 1.0)
@@ -131,7 +125,7 @@ def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, np
 
 def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
     """Compute world positions [N, 3] of pixels of a fitted view."""
-    to, z = view.camera, view.values.ravel()[pixels]
+    to, z = view.lens.pinhole, view.values.ravel()[pixels]
     x, y = (pixels % to.width + 0.5 - to.cx) / to.fx, (pixels // to.width + 0.5 - to.cy) / to.fy
     return np.stack([x * z, y * z, z], -1) @ view.rotation.T + view.center
 

@@ -77,7 +77,6 @@ class CaptureFacts:
         return metadata.get(KEY) or CaptureFacts()
 
     def select(self, indices: Sequence[int]) -> CaptureFacts:
-        """Select views."""
         per_view = {name: getattr(self, name) for name in ("lenses", "files", "maps", "fitted")}
         return replace(self, **{name: [some[i] for i in indices] for name, some in per_view.items() if some})
 

@@ -116,7 +116,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
     photographs: bool = False  # Put the held-out photographs into the bundle, for viewers to show beside renders.
 
     def main(self) -> None:
-        """Run the export."""
         exit_messages.install()
         reserved, earlier = False, None
         bake_options = self._options()
@@ -217,7 +216,6 @@ class ExportAtlas(BakeOptions, CompactOptions):
 
 
 def main() -> None:
-    """Run the command line of this module."""
     tyro.cli(tyro.conf.FlagConversionOff[ExportAtlas]).main()
 
 

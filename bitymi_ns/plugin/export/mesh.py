@@ -57,7 +57,6 @@ class ExportMesh(SurfaceOptions):
     overwrite: bool = False  # Replace an existing mesh.
 
     def main(self) -> None:
-        """Run the export."""
         exit_messages.install()
         path = self.output_dir / f"{NAME}.{self.format}"
         try:
@@ -78,12 +77,10 @@ class ExportMesh(SurfaceOptions):
             fail(f"{self.load_config}: {error}.", error)
 
     def _check_target(self, path: Path) -> None:
-        """Stop if the file exists and may not be replaced."""
         if os.path.lexists(path) and not self.overwrite:
             fail(f"{path} is there already: choose another --output-dir, or add --overwrite True.")
 
     def _write(self, source: MeshScene, path: Path) -> str:
-        """Write the mesh; return a summary."""
         to = to_capture(source.world) if self.frame == "capture" else None
         step = max(1, -(-len(source.cameras) // MOST_VIEWS))
         cameras = source.cameras[::step]

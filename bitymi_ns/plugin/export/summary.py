@@ -22,7 +22,6 @@ def decibels(value: float | None) -> str:
 
 
 def print_summary(folder: Path, info: Manifest) -> None:
-    """Print sizes, left-out surfels and errors."""
     statistics = info.statistics
     surfels = statistics.surfels
     table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
@@ -98,7 +97,6 @@ def print_savings(table: Table, info: Manifest) -> None:
 
 
 def print_view_color(table: Table, info: Manifest) -> None:
-    """Add rows for the reduced view colours: kept terms, bytes, error."""
     lean, stored = info.statistics.view_color, info.files[info.surfels.file].bytes
     if lean is None:
         table.add_row("View colour", "all of it is kept")
@@ -118,7 +116,6 @@ def print_view_color(table: Table, info: Manifest) -> None:
 
 
 def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:
-    """Add rows for the polish or the fine-tuning: steps, time, gain."""
     if not tuned.steps:
         table.add_row(name, f"none: {tuned.views} training views are too few for validation views")
         return
@@ -133,5 +130,4 @@ def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:
 
 
 def percentiles_text(error: Percentiles) -> str:
-    """Format percentiles of an error in 8-bit steps."""
     return f"median {error.p50:.2f}, 99 % {error.p99:.2f}, at most {error.p100:.2f} steps"

@@ -71,7 +71,6 @@ def world_of(datamanager: Any) -> World:
 
 @torch.no_grad()
 def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
-    """Draw the trained scene for a camera."""
     return _encoded(model.render(camera, model.background, maps=False).rgb, format)
 
 

@@ -68,8 +68,7 @@ class TrainingRun:
         if resume_state := model.resume_state:
             self.training.load_state_dict({"max_steps": model.trained_for, **resume_state})
             self._random_state = resume_state["random"]
-            if "capture" in resume_state:  # checkpoints of earlier versions have none
-                warn_of_other_capture(resume_state["capture"], self.capture)
+            warn_of_other_capture(resume_state.get("capture"), self.capture)
         # steps after which the curve gets a point: evenly spaced, with the last one
         self.curve_steps = {max(0, round(self.total * (i + 1) / curve_points) - 1) for i in range(curve_points)}
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
@@ -162,7 +161,6 @@ class TrainingRun:
         return {**self.training.state_dict(), "random": torch.get_rng_state(), "capture": self.capture}
 
     def before(self, step: int) -> None:
-        """Set the step's learning rates."""
         if self._random_state is not None:
             torch.set_rng_state(self._random_state)
             self._random_state = None

@@ -105,7 +105,6 @@ class _Reader(pickle._Unpickler):
 
 
 def _tensor(numbers: Tensor, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> Tensor:
-    """View a storage as a tensor."""
     if not all(type(n) is int and n >= 0 for n in (offset, *size, *stride)) or len(size) != len(stride):
         raise ValueError("a tensor's size is not a size")
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))

@@ -64,7 +64,6 @@ class Entry:
         return self.value
 
     def parts(self) -> list[Entry]:
-        """List all entries of a table."""
         return [self._part(key, value) for key, value in self.table().items()]
 
     def text(self) -> str:
@@ -104,7 +103,6 @@ def _name(dtype: torch.dtype) -> str:
 
 
 def _kind(value: Any) -> str:
-    """Describe a value for a message."""
     if isinstance(value, Tensor):
         laid_out = value.layout == torch.strided and not value.is_meta
         spread = "" if laid_out and value.is_contiguous() else ", not one after the other in memory"

@@ -68,7 +68,6 @@ def how_to_resume(folder: Path) -> str:
 
 
 def path_of(folder: Path, step: int) -> Path:
-    """Return the path of a step's checkpoint."""
     return folder / f"step-{step:09d}.ckpt"
 
 

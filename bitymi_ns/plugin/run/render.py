@@ -75,7 +75,6 @@ def target_of(command: Any) -> Path:
 
 
 def check_options(command: Any) -> None:
-    """Stop at options that cannot be used."""
     as_film = getattr(command, "output_format", "images") == "video"
     for name, low, high in (
         ("downscale_factor", 1 / MOST_PIXELS, MOST_PIXELS),

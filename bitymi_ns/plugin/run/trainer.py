@@ -228,7 +228,6 @@ class BitymiPipeline(VanillaPipeline):
         return {}, losses, self.model.get_metrics_dict({}, {})
 
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
-        """Load the parameters of a checkpoint."""
         try:
             super().load_pipeline(loaded_state, step)
         except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
@@ -238,8 +237,7 @@ class BitymiPipeline(VanillaPipeline):
         if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # in training the callbacks do this
             return
         state, held_out = self.model.resume_state, to_cameras(self.datamanager.eval_dataset.cameras, "cpu")
-        if "capture" in state:  # checkpoints of earlier versions have none
-            warn_of_other_capture(state["capture"], capture_fingerprint(self.datamanager.train_dataset))
+        warn_of_other_capture(state.get("capture"), capture_fingerprint(self.datamanager.train_dataset))
         if (poses := state.get("poses")) is not None and poses["motions"] is not None:
             self.model.carry = self.datamanager.move_cameras(poses["motions"])
         _, found = self.datamanager.corrections(state.get("exposure"))

@@ -41,11 +41,8 @@ class Backend:
     use: Callable[[], AbstractContextManager[object]] = nullcontext  # context that selects it in `bitymi_ns.ops`
 
 
-BACKENDS: dict[str, Backend] = {
-    "cpu": Backend("cpu", "cpu"),
-    "cuda": Backend("cuda", "cuda"),
-    "emulated": Backend("emulated", "cpu", emulated_cuda),
-}
+_ALL = (Backend("cpu", "cpu"), Backend("cuda", "cuda"), Backend("emulated", "cpu", emulated_cuda))
+BACKENDS = {backend.name: backend for backend in _ALL}
 """Backends by name; tests/stress runs every case on the available ones. `emulated`: CUDA kernels run on the host."""
 
 
@@ -63,13 +60,7 @@ def missing(backend: Backend) -> str:
 
 
 IMAGES = ("rgb", "alpha", "depth", "normal", "beta_map")
-CHANNELS = {
-    "rgb": slice(0, 3),
-    "alpha": slice(3, 4),
-    "beta_map": slice(4, 5),
-    "depth": slice(5, 6),
-    "normal": slice(6, 9),
-}
+SIZES = {"rgb": 3, "alpha": 1, "beta_map": 1, "depth": 1, "normal": 3}
 """Channels of the image of `ops.blended_image`."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
@@ -184,7 +175,8 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
     if way.texels:
         between = torch.zeros(shape, dtype=torch.int64)
         between[pixel, surfel] = cells(fragments.uv.T).cpu()
-    return _Result({key: image[:, CHANNELS[key]] for key in IMAGES}, blended, low_pass, leaves, between)
+    parts = dict(zip(SIZES, image.split(list(SIZES.values()), dim=1), strict=True))
+    return _Result({key: parts[key] for key in IMAGES}, blended, low_pass, leaves, between)
 
 
 def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
@@ -216,8 +208,7 @@ def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor, keep
     leaves = result.leaves
     loss = 0.0
     for key, image in result.images.items():
-        weight = torch.where(pixels[:, None], weights[key], 0.0)
-        loss = loss + (image * weight.to(image)).sum()
+        loss = loss + (image * torch.where(pixels[:, None], weights[key], 0.0).to(image)).sum()
     grads = torch.autograd.grad(loss, list(leaves.values()), retain_graph=keep, allow_unused=True)
     return {
         key: torch.zeros_like(leaf, dtype=torch.float64, device="cpu") if grad is None else grad.detach().double().cpu()
@@ -226,20 +217,16 @@ def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor, keep
 
 
 def _image_error(got: dict[str, Tensor], want: dict[str, Tensor], pixels: Tensor) -> float:
-    errors = [0.0]
-    for key, image in want.items():
-        values = image.detach()
-        error = (got[key].detach().double().cpu() - values).abs()[pixels]
-        scale = values.abs().max().item() if values.numel() else 0.0
-        if error.numel():
-            errors.append(error.max().item() / scale if scale > NOTHING else error.max().item())
-    return max(errors, key=_order)
+    return max((_relative(got[key], want[key], pixels) for key in want), key=_order)
 
 
-def _relative(got: Tensor, want: Tensor) -> float:
-    if not want.numel():
+def _relative(got: Tensor, want: Tensor, rows: Tensor | slice = slice(None)) -> float:
+    """Compute the largest error in `rows`, relative to the largest value of `want` in all rows."""
+    want = want.detach()
+    errors = (got.detach().double().cpu() - want).abs()[rows]
+    if not errors.numel():
         return 0.0
-    scale, error = want.abs().max().item(), (got - want).abs().max().item()
+    scale, error = want.abs().max().item(), errors.max().item()
     return error / scale if scale > NOTHING else error
 
 

@@ -4,9 +4,12 @@ stiffness."""
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from bitymi_ns.ops import VIEW_COLORS, TexelTiles
 from bitymi_ns.ops.constants import SUPPORT
@@ -26,7 +29,6 @@ class SceneCase:
     height: int
     background: Tensor  # [3]
     tiles: list[Tensor] | None = None  # one [r_v, r_u, 3] per surfel
-    single: bool = True  # True: float32 must agree with float64; False: it must only be finite
 
 
 def random_scene(
@@ -61,7 +63,7 @@ def random_scene(
     return SceneCase(name, params, viewmat, K, width, height, background)
 
 
-def front_scene(n: int, seed: int, width: int = 24, height: int = 16, **kwargs: float) -> SceneCase:
+def front_scene(n: int, seed: int, width: int = 24, height: int = 16, **kwargs: Any) -> SceneCase:
     """Generate a random scene in front of a camera at the origin, whose frame is the world frame."""
     case = random_scene(n, seed, width, height, **kwargs)
     case.params["means"] = case.params["means"] @ case.viewmat[:3, :3].T + case.viewmat[:3, 3]
@@ -69,94 +71,76 @@ def front_scene(n: int, seed: int, width: int = 24, height: int = 16, **kwargs: 
     return case
 
 
-def with_params(case: SceneCase, name: str, single: bool = True, **params: Tensor | float) -> SceneCase:
+def changed(case: SceneCase, name: str = "", **params: Tensor | float) -> SceneCase:
     """Copy and rename a case with some parameters replaced; a number fills the whole parameter."""
     new = {key: value.clone() for key, value in case.params.items()}
     for key, value in params.items():
         new[key] = torch.full_like(new[key], value) if isinstance(value, int | float) else value
-    return replace(case, name=name, params=new, single=single)
+    return replace(case, name=name, params=new)
+
+
+def quaternions(R: Tensor) -> Tensor:
+    """Convert rotation matrices [N, 3, 3] to quaternions wxyz [N, 4]."""
+    return torch.from_numpy(Rotation.from_matrix(R.numpy()).as_quat()[:, [3, 0, 1, 2]])
+
+
+def rays_and_sides(means: Tensor) -> tuple[Tensor, Tensor]:
+    """Compute the directions of the rays to centres [N, 3] from the origin, and perpendicular ones."""
+    rays = normalize(means, dim=-1)
+    helper = torch.tensor([[0.3, 1.0, 0.2]], dtype=torch.float64).expand_as(rays)
+    return rays, normalize(torch.linalg.cross(rays, helper), dim=-1)
 
 
 def extreme_scenes() -> list[SceneCase]:
     """Build scenes of finite inputs that break renderers: images and gradients must be finite."""
     base = front_scene(12, 0)
-    means, zero = base.params["means"], torch.zeros(12, dtype=torch.float64)
-    cases = []
+    means, logs, quats = (base.params[key] for key in ("means", "log_scales", "quats"))
 
     # axis u along the ray, v along the camera's y axis where possible: the ray lies in the disc's plane
-    along = torch.nn.functional.normalize(means, dim=-1)
-    side = torch.nn.functional.normalize(
-        torch.linalg.cross(along, torch.tensor([[0.3, 1.0, 0.2]]).double().expand(12, 3))
-    )
-    R = torch.stack([along, torch.linalg.cross(side, along), side], dim=-1)
-    cases.append(with_params(base, "edge_on", single=False, quats=quaternions(R)))
-
-    big = torch.full((12, 2), math.log(3.0), dtype=torch.float64)
-    cases.append(with_params(base, "through_the_camera_plane", means=means * 0.3, log_scales=big))
-    cases.append(with_params(base, "behind_the_camera", means=-means))
-    on_plane = means.clone()
+    along, side = rays_and_sides(means)
+    edge_on = quaternions(torch.stack([along, torch.linalg.cross(side, along), side], dim=-1))
+    on_plane, level, some_zero = means.clone(), means.clone(), quats.clone()
     on_plane[:, 2] = 0.2
-    cases.append(with_params(base, "centre_on_the_near_plane", single=False, means=on_plane))
-    cases.append(with_params(base, "surfel_on_the_camera_centre", means=torch.zeros_like(means)))
-
-    cases.append(with_params(base, "subpixel", log_scales=math.log(1e-4)))
-    cases.append(with_params(base, "screen_filling", single=False, log_scales=math.log(1e3)))
-    ratio = torch.stack([zero, zero - math.log(1e6)], dim=-1)
-    cases.append(with_params(base, "axis_ratio_1e6", single=False, log_scales=ratio))
-    cases.append(with_params(base, "zero_scales", single=False, log_scales=-200.0))
-    cases.append(with_params(base, "huge_scales", single=False, log_scales=20.0))
-    some_zero = base.params["quats"].clone()
+    level[:, 2] = 4.0
     some_zero[::2] = 0
-    cases.append(with_params(base, "zero_quaternions", quats=some_zero))
-    cases.append(with_params(base, "tiny_quaternions", quats=base.params["quats"] * 1e-15))
-    cases.append(with_params(base, "long_quaternions", quats=base.params["quats"] * 1e15))
-
-    cases.append(with_params(base, "opacity_0", opacity_logits=-100.0))
-    cases.append(with_params(base, "opacity_1_255", single=False, opacity_logits=-math.log(254.0)))
-    cases.append(with_params(base, "opacity_1", opacity_logits=100.0))
-    cases.append(with_params(base, "beta_0", single=False, beta_raw=-100.0))
-    cases.append(with_params(base, "beta_small", beta_raw=-6.0))
-    cases.append(with_params(base, "beta_4", beta_raw=100.0))
-
-    cases.append(with_params(base, "temperature_1e4", single=False, sv_log_tau=math.log(1e4)))
-    cases.append(with_params(base, "temperature_0", sv_log_tau=-100.0))
-    cases.append(with_params(base, "sites_of_length_0", sv_sites=0.0))
-
+    thin = torch.tensor([0.0, -math.log(1e6)], dtype=torch.float64).expand(12, 2)
     crowd = front_scene(3000, 1, 2, 2)
     at_center = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64) + 1e-3 * crowd.params["means"]
-    cases.append(with_params(crowd, "thousands_on_one_pixel", means=at_center, opacity_logits=-5.0))
-    level = means.clone()
-    level[:, 2] = 4.0
-    cases.append(with_params(base, "equal_depths", means=level))
-    same = {key: value[:1].expand_as(value).clone() for key, value in base.params.items()}
-    cases.append(with_params(base, "identical_surfels", **same))
-
-    cases.append(
-        with_params(base, "coordinates_1e6", means=means * 1e6, log_scales=base.params["log_scales"] + math.log(1e6))
-    )
     offset = torch.tensor([1e6, -1e6, 1e6], dtype=torch.float64)
-    shifted = with_params(base, "camera_at_1e6", single=False, means=means + offset)
+    shifted = changed(base, "camera_at_1e6", means=means + offset)
     shifted.viewmat = base.viewmat.clone()
     shifted.viewmat[:3, 3] = -offset
-    cases.append(shifted)
-
-    none = {key: value[:0] for key, value in base.params.items()}
-    cases.append(with_params(base, "no_surfels", **none))
-    for width, height in ((1, 1), (8192, 1), (1, 8192)):
-        cases.append(replace(front_scene(12, 2, width, height), name=f"image_{width}x{height}"))
-    return cases
-
-
-def quaternions(R: Tensor) -> Tensor:
-    """Convert rotation matrices [N, 3, 3] to quaternions wxyz [N, 4], by the dominant eigenvector of a 4 x 4 matrix."""
-    xx, xy, xz, yx, yy, yz, zx, zy, zz = R.flatten(1).unbind(-1)
-    rows = [
-        torch.stack([xx + yy + zz, zy - yz, xz - zx, yx - xy], -1),
-        torch.stack([zy - yz, xx - yy - zz, xy + yx, xz + zx], -1),
-        torch.stack([xz - zx, xy + yx, yy - xx - zz, yz + zy], -1),
-        torch.stack([yx - xy, xz + zx, yz + zy, zz - xx - yy], -1),
+    return [
+        changed(base, "edge_on", quats=edge_on),
+        changed(base, "through_the_camera_plane", means=means * 0.3, log_scales=math.log(3.0)),
+        changed(base, "behind_the_camera", means=-means),
+        changed(base, "centre_on_the_near_plane", means=on_plane),
+        changed(base, "surfel_on_the_camera_centre", means=0.0),
+        changed(base, "subpixel", log_scales=math.log(1e-4)),
+        changed(base, "screen_filling", log_scales=math.log(1e3)),
+        changed(base, "axis_ratio_1e6", log_scales=thin),
+        changed(base, "zero_scales", log_scales=-200.0),
+        changed(base, "huge_scales", log_scales=20.0),
+        changed(base, "zero_quaternions", quats=some_zero),
+        changed(base, "tiny_quaternions", quats=quats * 1e-15),
+        changed(base, "long_quaternions", quats=quats * 1e15),
+        changed(base, "opacity_0", opacity_logits=-100.0),
+        changed(base, "opacity_1_255", opacity_logits=-math.log(254.0)),
+        changed(base, "opacity_1", opacity_logits=100.0),
+        changed(base, "beta_0", beta_raw=-100.0),
+        changed(base, "beta_small", beta_raw=-6.0),
+        changed(base, "beta_4", beta_raw=100.0),
+        changed(base, "temperature_1e4", sv_log_tau=math.log(1e4)),
+        changed(base, "temperature_0", sv_log_tau=-100.0),
+        changed(base, "sites_of_length_0", sv_sites=0.0),
+        changed(crowd, "thousands_on_one_pixel", means=at_center, opacity_logits=-5.0),
+        changed(base, "equal_depths", means=level),
+        changed(base, "identical_surfels", **{k: v[:1].expand_as(v).clone() for k, v in base.params.items()}),
+        changed(base, "coordinates_1e6", means=means * 1e6, log_scales=logs + math.log(1e6)),
+        shifted,
+        changed(base, "no_surfels", **{key: value[:0] for key, value in base.params.items()}),
+        *(front_scene(12, 2, w, h, name=f"image_{w}x{h}") for w, h in ((1, 1), (8192, 1), (1, 8192))),
     ]
-    return torch.linalg.eigh(torch.stack(rows, -2)).eigenvectors[..., -1]
 
 
 @dataclass(frozen=True)
@@ -176,66 +160,45 @@ def decades(first: int, last: int) -> tuple[float, ...]:
     return tuple(10.0**k for k in range(first, last + step, step))
 
 
-N, WIDTH, HEIGHT = 16, 24, 16
+def _small(seed: int, n: int = 16, scale: float = 0.25) -> SceneCase:
+    return front_scene(n, seed, 24, 16, scale=scale)
 
 
 def _edge_on(angle: float) -> SceneCase:
     """Build discs whose planes make this angle with the ray through their centres."""
-    base = front_scene(N, 0, WIDTH, HEIGHT, scale=0.5)
-    ray = torch.nn.functional.normalize(base.params["means"], dim=-1)
-    helper = torch.tensor([[0.3, 1.0, 0.2]], dtype=torch.float64).expand(N, 3)
-    side = torch.nn.functional.normalize(torch.linalg.cross(ray, helper), dim=-1)
-    up = torch.linalg.cross(side, ray)
-    along = math.cos(angle) * ray + math.sin(angle) * up
+    base = _small(0, scale=0.5)
+    ray, side = rays_and_sides(base.params["means"])
+    along = math.cos(angle) * ray + math.sin(angle) * torch.linalg.cross(side, ray)
     rotation = torch.stack([along, side, torch.linalg.cross(along, side)], dim=-1)
-    return with_params(base, f"edge_on_{angle:g}", quats=quaternions(rotation))
+    return changed(base, quats=quaternions(rotation))
 
 
 def _near_plane(depth: float) -> SceneCase:
     """Build discs of scale 0.5 with centres at 0.5 to 1.5 times this depth."""
-    base = front_scene(N, 1, WIDTH, HEIGHT, scale=0.5)
-    means = base.params["means"]
-    return with_params(base, f"near_{depth:g}", means=means * (depth / 4.0))
-
-
-def _beta(beta: float) -> SceneCase:
-    base = front_scene(N, 2, WIDTH, HEIGHT)
-    return with_params(base, f"beta_{beta:g}", beta_raw=math.log(beta) - math.log(4 - beta))
-
-
-def _temperature(tau: float) -> SceneCase:
-    return with_params(front_scene(N, 3, WIDTH, HEIGHT), f"tau_{tau:g}", sv_log_tau=math.log(tau))
+    base = _small(1, scale=0.5)
+    return changed(base, means=base.params["means"] * (depth / 4.0))
 
 
 def _axis_ratio(ratio: float) -> SceneCase:
-    base = front_scene(N, 4, WIDTH, HEIGHT, scale=0.8)
+    base = _small(4, scale=0.8)
     logs = base.params["log_scales"].clone()
     logs[:, 1] = logs[:, 0] - math.log(ratio)
-    return with_params(base, f"ratio_{ratio:g}", log_scales=logs)
+    return changed(base, log_scales=logs)
 
 
 def _world(size: float) -> SceneCase:
     """Build a scene and an oblique camera moved away from the origin, where float32 positions are coarse."""
-    base = random_scene(N, 5, WIDTH, HEIGHT)
+    base = random_scene(16, 5, 24, 16)
     shift = size * torch.tensor([0.6, -0.7, 0.39], dtype=torch.float64)
     viewmat = base.viewmat.clone()
     viewmat[:3, 3] -= viewmat[:3, :3] @ shift
-    moved = with_params(base, f"world_{size:g}", means=base.params["means"] + shift)
-    return replace(moved, viewmat=viewmat)
-
-
-def _opacity(transparency: float) -> SceneCase:
-    base = front_scene(N, 6, WIDTH, HEIGHT)
-    logit = math.log1p(-transparency) - math.log(transparency)
-    return with_params(base, f"opacity_{transparency:g}", opacity_logits=logit)
+    return replace(changed(base, means=base.params["means"] + shift), viewmat=viewmat)
 
 
 def _layers(count: float) -> SceneCase:
     """Build large overlapping discs, so faint that all of them are blended."""
-    n = int(count)
-    base = front_scene(n, 7, 8, 6, scale=2.0)
-    opacity = min(0.5, max(0.006, 6.0 / n))
-    return with_params(base, f"layers_{n}", opacity_logits=math.log(opacity / (1 - opacity)))
+    opacity = min(0.5, max(0.006, 6.0 / count))
+    return changed(front_scene(int(count), 7, 8, 6, scale=2.0), opacity_logits=math.log(opacity / (1 - opacity)))
 
 
 SWEEPS: tuple[Sweep, ...] = (
@@ -247,11 +210,21 @@ SWEEPS: tuple[Sweep, ...] = (
         lambda d: _near_plane(0.5 * d),
         near=lambda d: 0.05 * d,
     ),
-    Sweep("beta", "beta", (3.9, 1.0, *decades(-1, -7)), _beta),
-    Sweep("temperature", "temperature", (*decades(0, 6),), _temperature),
+    Sweep(
+        "beta",
+        "beta",
+        (3.9, 1.0, *decades(-1, -7)),
+        lambda beta: changed(_small(2), beta_raw=math.log(beta) - math.log(4 - beta)),
+    ),
+    Sweep("temperature", "temperature", decades(0, 6), lambda tau: changed(_small(3), sv_log_tau=math.log(tau))),
     Sweep("axis ratio", "axis ratio", decades(0, 6), _axis_ratio),
     Sweep("world size", "distance from the origin / size of the scene", decades(0, 6), _world),
-    Sweep("opacity", "1 - opacity", (0.5, *decades(-1, -7)), _opacity),
+    Sweep(
+        "opacity",
+        "1 - opacity",
+        (0.5, *decades(-1, -7)),
+        lambda clear: changed(_small(6), opacity_logits=math.log1p(-clear) - math.log(clear)),
+    ),
     Sweep("layers", "layers", (1, 4, 16, 64, 256, 1024), _layers),
 )
 

@@ -9,6 +9,7 @@ limit."""
 import argparse
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -169,20 +170,13 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
     if limit < 5:
         return f"| {step.name} | not begun: no time left | |"
     command, text = [str(word) for word in step.command], logs / f"{step.name}.txt"
+    limited = ["timeout", "--signal=KILL", str(limit), *command]  # with all its children
     # unbuffered, so that logs are complete
     with tempfile.TemporaryDirectory() as folder, text.open("w") as log:
         environment = {**environment, "TMPDIR": folder, "PYTHONUNBUFFERED": "1"}
         print(*command, file=log, flush=True)
-        how = {"cwd": tree, "env": environment, "stdout": log, "stderr": subprocess.STDOUT}
-        try:
-            process = subprocess.Popen(command, start_new_session=True, **how)
-            result = str(process.wait(limit))
-        except OSError as error:
-            result = str(error)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, 9)
-            process.wait()
-            result = "stopped"
+        done = subprocess.run(limited, cwd=tree, env=environment, stdout=log, stderr=subprocess.STDOUT, check=False)
+    result = "stopped" if done.returncode == -signal.SIGKILL else str(done.returncode)
     last = text.read_text(errors="replace").strip().splitlines()[-1].replace("|", "/")
     result += "" if result == "0" else f": {last}"
     return f"| {step.name} | {result} | {time.perf_counter() - start:.0f} |"

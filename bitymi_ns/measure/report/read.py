@@ -18,6 +18,7 @@ from bitymi_ns.measure.report.records import (
     ReportError,
     curve_from,
     evaluation_from,
+    grouped,
     link,
 )
 from bitymi_ns.safe_reading import read_text as text_of
@@ -75,32 +76,33 @@ def read_jsonl(path: Path) -> tuple[list[Evaluation], list[Curve], list[str]]:
 def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
     """Add the cells of a benchmark, and the curves and images that they name, if these exist. `cells`: of the file
     `path`. Raises ReportError: a cell lacks an entry that its kind requires."""
-    keys: dict[str, dict[str, Any]] = {}  # identity of a run -> a cell's key
-    runs: dict[str, dict[tuple[str, str], dict[str, Any]]] = {}  # identity of a run -> (kind, bundle) -> value
-    for cell in cells:
-        key, run = cell["key"], identity(cell["key"], *_NOT_OF_A_RUN)
-        keys.setdefault(run, key)
-        runs.setdefault(run, {})[str(key.get("cell")), str(key.get("bundle") or "")] = cell["value"]
-        made = cell.get("made")
-        machine = made.get("machine") if isinstance(made, dict) else None
-        if machine and machine not in records.machines:
-            records.machines.append(str(machine))
-    names = {run: str(key.get("row") or key.get("method") or "unnamed method") for run, key in keys.items()}
-    namesakes = Counter((str(key.get("scene")), names[run], str(key.get("seed"))) for run, key in keys.items())
+    runs = grouped(cells, lambda cell: identity(cell["key"], *_NOT_OF_A_RUN))
+    keys = {run: of_run[0]["key"] for run, of_run in runs.items()}
     series = {run: identity(key, *_NOT_OF_A_RUN, "seed") for run, key in keys.items()}
-    seeds = Counter(series[run] for run in keys)
+    seeds = Counter(series.values())
+    named = {run: (str(key.get("scene") or "unnamed scene"), _row_of(key)) for run, key in keys.items()}
+    namesakes = Counter((*named[run], str(key.get("seed"))) for run, key in keys.items())
     for run, key in keys.items():
-        name, seed, steps = names[run], key.get("seed"), key.get("steps")
-        if namesakes[str(key.get("scene")), name, str(seed)] > 1:  # runs that differ in their length
+        (scene, name), seed, steps = named[run], key.get("seed"), key.get("steps")
+        if namesakes[scene, name, str(seed)] > 1:  # runs that differ in their length
             name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
         suffix = f", seed {seed}" if seeds[series[run]] > 1 and seed is not None else ""
-        scene = str(key.get("scene") or "unnamed scene")
         trained = Evaluation(scene, name, False, name + suffix, {}, path, run, name, series[run], seed)
         _add_run(trained, suffix, runs[run], records)
 
 
-def _add_run(trained: Evaluation, suffix: str, cells: dict[tuple[str, str], dict[str, Any]], records: Records) -> None:
+def _row_of(key: dict[str, Any]) -> str:
+    return str(key.get("row") or key.get("method") or "unnamed method")
+
+
+def _add_run(trained: Evaluation, suffix: str, of_run: list[dict[str, Any]], records: Records) -> None:
     """Add the cells of a run; `trained` is the evaluation of its trained scene without results."""
+    cells: dict[tuple[str, str], dict[str, Any]] = {}  # by kind and bundle
+    for cell in of_run:
+        cells[str(cell["key"].get("cell")), str(cell["key"].get("bundle") or "")] = cell["value"]
+        machine = cell["made"].get("machine") if isinstance(cell.get("made"), dict) else None
+        if machine and machine not in records.machines:
+            records.machines.append(str(machine))
     folder, train = trained.source.parent, cells.get(("train", ""), {})
     figures = finite_numbers(train)
     times = {f"train_{k}": figures[k] for k in ("seconds", "cpu_seconds", "peak_bytes") if k in figures}

@@ -26,13 +26,13 @@ from zlib import crc32
 import torch
 import yaml
 from harness import Arguments, means, publish, say
-from scenes import SplitCapture, load_capture
+from scenes import load_capture
 from torch import Tensor
 
 from bitymi_ns import bake_scene
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.locks import Busy, Lock
-from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance, without_nan
+from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance
 from bitymi_ns.measure.machine import commit
 from bitymi_ns.measure.report.read import add_cells
 from bitymi_ns.measure.report.records import Records, over_seeds
@@ -134,17 +134,13 @@ def forget_peak(device: torch.device) -> None:
 load = functools.lru_cache(maxsize=1)(load_capture)
 
 
-def cut(capture: SplitCapture, photographs: int) -> SplitCapture:
-    """Keep at most `photographs` training photographs (0 = all), evenly spaced; held-out ones do not change."""
-    kept = spread(len(capture.train), photographs or len(capture.train))
-    return replace(capture, train=[capture.train[i] for i in kept])
-
-
 def measure(run: LongRun) -> Figures:
     """Train, evaluate and, if requested, bake a run."""
     options, preset = run.options, preset_of(run.row)
     preset.train.seed = run.seed
-    capture, device = cut(load(run.data, run.reduction), options.photographs), torch.device(options.device)
+    capture, device = load(run.data, run.reduction), torch.device(options.device)
+    kept = spread(len(capture.train), options.photographs or len(capture.train))
+    capture = replace(capture, train=[capture.train[i] for i in kept])  # held-out ones do not change
     if capture.white:
         preset.train.alpha_color = "white"
     forget_peak(device)
@@ -217,7 +213,7 @@ def main() -> None:
             found = measure(run)
             made = provenance(sys.argv, time.perf_counter() - start)
             for name, value in found.items():
-                cells.add(run.key(name), without_nan(value), made)
+                cells.add(run.key(name), value, made)
             said = finite_numbers({**found["train"], **found["eval"]["results"]})
             say(", ".join(f"{name} {figure:.4g}" for name, figure in said.items()))
     cells.refresh()

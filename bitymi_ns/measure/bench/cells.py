@@ -77,9 +77,11 @@ class Cells:
         return self._known.get(identity(key))
 
     def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:
-        """Append a cell, after removing a truncated last line. Raises BenchError: the file cannot be written."""
+        """Append a cell, after removing a truncated last line; NaN and infinite numbers, which JSON cannot hold, become
+        None. Raises BenchError: the file cannot be written."""
         cell = {"key": key, "value": value, "made": origin}
-        line = json.dumps(cell, allow_nan=False).encode("utf8") + b"\n"
+        cell = json.loads(json.dumps(cell), parse_constant=lambda constant: None)
+        line = json.dumps(cell).encode("utf8") + b"\n"
         with write_errors_as(self.path, BenchError, ", with --work"):
             self.path.parent.mkdir(parents=True, exist_ok=True)
             with open(self.path, "a+b", opener=no_links) as file:
@@ -90,8 +92,3 @@ class Cells:
                 file.flush()
                 os.fsync(file.fileno())
         self._known[identity(key)] = cell
-
-
-def without_nan(value: dict[str, Any]) -> dict[str, Any]:
-    """Replace NaN and infinite numbers, which JSON cannot hold, by None."""
-    return json.loads(json.dumps(value), parse_constant=lambda constant: None)

@@ -9,7 +9,7 @@ from typing import Any
 
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.locks import Busy, Lock
-from bitymi_ns.measure.bench.cells import FILE, Cells, provenance, without_nan
+from bitymi_ns.measure.bench.cells import FILE, Cells, provenance
 from bitymi_ns.measure.bench.matrix import CellSpec, Chain
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool
 from bitymi_ns.measure.report.read import read_jsonl
@@ -54,7 +54,7 @@ def read_result(work: Path, cell: CellSpec) -> dict[str, Any]:
     there are no readable figures."""
     readers = {"train": _train, "export": _export, "eval": _evaluation}
     try:
-        return without_nan(readers[cell.kind](work, cell))
+        return readers[cell.kind](work, cell)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CommandFailed(f"{cell}: the command left no figures that can be read: {error}") from error
 

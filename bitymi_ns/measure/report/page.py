@@ -8,7 +8,7 @@ from typing import Any
 from bitymi_ns import __version__
 from bitymi_ns.files import check_writable, write_errors_as, write_file
 from bitymi_ns.measure.markdown import rendered
-from bitymi_ns.measure.report.pictures import ERROR_CAPTION, compare_views
+from bitymi_ns.measure.report.pictures import ERROR_SCALE, compare_views
 from bitymi_ns.measure.report.plots import draw_plots
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import Records, ReportError, grouped, over_seeds
@@ -17,10 +17,6 @@ from bitymi_ns.safe_reading import open_regular
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="bitymi report">'  # marks pages that may be replaced
-TEXTS = {
-    "views": f"The worst, the median and the best view by the PSNR of these pictures, with their {ERROR_CAPTION}.",
-    "tables": NOTES,
-}
 
 
 def compose(records: Records, title: str) -> dict[str, Any]:
@@ -42,7 +38,7 @@ def compose(records: Records, title: str) -> dict[str, Any]:
 
 def to_page(content: dict[str, Any]) -> str:
     """Render the report as a self-contained HTML document."""
-    return rendered("report.html.j2", content=content, generator=GENERATOR, texts=TEXTS)
+    return rendered("report.html.j2", content=content, generator=GENERATOR, columns=NOTES, error_scale=ERROR_SCALE)
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:

@@ -21,7 +21,6 @@ from bitymi_ns.safe_reading import open_regular
 SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
 """File name stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
-ERROR_CAPTION = f"error: mean of |difference| over the colours, 0 (black) to {ERROR_SCALE:g} (yellow)"
 MAX_SETS = 4  # sets of photographs per page
 MAX_WIDTH = 1200  # of embedded images, pixels
 RANKS = {"Worst view": 0.0, "Median view": 0.5, "Best view": 1.0}

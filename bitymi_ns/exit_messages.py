@@ -7,7 +7,7 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -61,7 +61,7 @@ def line_of(error: BaseException) -> str | None:
     return f"{name} cannot be read or written: {cause}"
 
 
-def end_as_by_ctrl_c() -> list[int]:
+def end_as_by_ctrl_c() -> list[signal.Signals]:
     """Have the signals of batch systems and of terminals that are gone raise KeyboardInterrupt, so that what was begun
     is removed; those that are handled or ignored stay as they are. Return those that have changed."""
     if threading.current_thread() is not threading.main_thread():
@@ -72,7 +72,7 @@ def end_as_by_ctrl_c() -> list[int]:
     return changed
 
 
-def _end_by_default(numbers: list[int]) -> None:
+def _end_by_default(numbers: Sequence[int]) -> None:
     for number in numbers:
         signal.signal(number, signal.SIG_DFL)
 

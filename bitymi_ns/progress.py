@@ -19,9 +19,10 @@ def no_progress(step: str, done: int, total: int) -> None:
 def rich_progress() -> Iterator[Progress]:
     """Create a callback that draws one bar per step; `with rich_progress() as progress: bake(..., progress)`."""
     from rich.progress import Progress as Bars  # lazily: only needed in a terminal
+    from rich.progress import TaskID
 
     with Bars() as bars:
-        tasks: dict[str, int] = {}
+        tasks: dict[str, TaskID] = {}
 
         def update(step: str, done: int, total: int) -> None:
             if step not in tasks:

@@ -9,9 +9,9 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from io import TextIOWrapper
+from io import BufferedReader, TextIOWrapper
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn, TextIO
+from typing import Any, NoReturn, TextIO
 
 from rich.filesize import decimal
 
@@ -21,7 +21,7 @@ from bitymi_ns.trust import LONGEST, json_of
 MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs need a tenth of it
 
 
-def open_regular(path: Path) -> BinaryIO:
+def open_regular(path: Path) -> BufferedReader:
     """Open a regular file for reading, also through a link. A folder, pipe or device is refused before it is opened:
     opening a pipe blocks. Raises OSError: the file does not exist, is not regular, or cannot be opened; `strerror` says
     which."""
@@ -50,7 +50,7 @@ def open_text(path: Path, errors: str = "strict") -> TextIO:
     """Open a text file in the encoding of its byte order mark (written by Windows programs), or else in UTF-8; raises
     what `open_regular` raises."""
     file = open_regular(path)
-    wide = file.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)  # type: ignore[attr-defined]
+    wide = file.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return TextIOWrapper(file, encoding="utf-16" if wide else "utf-8-sig", errors=errors)
 
 

@@ -27,7 +27,7 @@ class Refused(PermissionError):
         super().__init__(errno.EPERM, message, str(path))
 
     def __str__(self) -> str:
-        return self.strerror
+        return str(self.strerror)
 
 
 def no_links(name: str | os.PathLike[str], flags: int) -> int:

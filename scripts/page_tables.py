@@ -100,13 +100,16 @@ def ranges() -> dict[str, list[float]]:
 
 def words_of(struct: np.dtype) -> dict[str, int]:
     """List the offsets of a struct's fields in words, by name."""
-    return {re.sub(r"_(\w)", lambda part: part[1].upper(), name): at // 4 for name, (_, at) in struct.fields.items()}
+    return {
+        re.sub(r"_(\w)", lambda part: part[1].upper(), name): at // 4
+        for name, (_, at, *_) in (struct.fields or {}).items()
+    }
 
 
 def at_word(parameter: str) -> tuple[int, int]:
     """Return a parameter's first word of a surfel, and their number."""
     field = FIELDS[parameter]
-    return SURFEL.fields[field][1] // 4, math.prod(SURFEL[field].shape)
+    return (SURFEL.fields or {})[field][1] // 4, math.prod(SURFEL[field].shape)
 
 
 def tables() -> str:

@@ -2,11 +2,12 @@
 """Print the project's requirements with its dev extra, one per line without spaces, for the Makefile's pip call."""
 
 import re
+import sys
 from pathlib import Path
 
-try:
+if sys.version_info >= (3, 11):
     import tomllib
-except ModuleNotFoundError:  # Python 3.10: use pip's
+else:
     from pip._vendor import tomli as tomllib
 
 

@@ -225,7 +225,7 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
     return baked.stating(rounding=rounding, view_color=_thinned(baked))
 
 
-def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float]] | None:
+def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | None]] | None:
     """Measure bytes and PSNR at about half and twice the bytes, relative to the chosen; None without views."""
     if not coder.measured:
         return None

@@ -1,6 +1,6 @@
 """Reduction of a bake: invisible and unstorable surfels are dropped, tiles and view colours reduced."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -13,12 +13,13 @@ from bitymi_ns.bake.view_colors import reduce_view_colors
 from bitymi_ns.bundle.statistics import KeptSurfels, LeftOut
 from bitymi_ns.codec.limits import within
 from bitymi_ns.ops.constants import ALPHA_MIN
+from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
 
-def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
+def drawable(surfels: Tensors) -> tuple[Tensor, LeftOut]:
     """Find the rows [N] int64 that can be drawn and stored; count those left out, by reason."""
     finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)
     scales = surfels["log_scales"].exp()
@@ -35,9 +36,9 @@ def drawable(surfels: Mapping[str, Tensor]) -> tuple[Tensor, LeftOut]:
     )
 
 
-def _as_rows(surfels: Mapping[str, Tensor]) -> list[Tensor]:
+def _as_rows(surfels: Tensors) -> list[Tensor]:
     """Give every parameter at least two dimensions."""
-    return [value.detach() if value.dim() > 1 else value.detach()[:, None] for value in surfels.values()]
+    return [value.detach() if value.dim() > 1 else value.detach()[:, None] for _, value in surfels.items()]
 
 
 def drop_unseen(

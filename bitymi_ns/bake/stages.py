@@ -40,6 +40,7 @@ from bitymi_ns.codec.texel_codes import (
     residual_codes,
 )
 from bitymi_ns.ops import TexelAlpha, TexelTiles
+from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
@@ -50,7 +51,9 @@ S = TypeVar("S", bound="Stage")
 class BakeableScene(Protocol):
     """The part of a scene that the bake uses."""
 
-    surfels: Mapping[str, Tensor]
+    @property
+    def surfels(self) -> Tensors: ...
+
     field: Any  # a residual field, a `TexelField`, or None
     near: float
     config: Any  # weight_bound

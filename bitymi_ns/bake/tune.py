@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import torch
 from pydantic import NonNegativeInt
@@ -38,6 +38,14 @@ class StoredTexels(Generic[F]):
     listed: Tensor  # [T, 3] what was coded
     texels: Tensor  # [T, 3] as they are drawn
     stored: F
+
+
+class TexelCoding(Protocol[F]):
+    """`Cosines` or `Pages`."""
+
+    def first(self, texels: Tensor) -> StoredTexels[F]: ...
+    def again(self, texels: Tensor) -> StoredTexels[F]: ...
+    def last(self, best: StoredTexels[F]) -> StoredTexels[F]: ...
 
 
 class Cosines:
@@ -223,7 +231,7 @@ def _coded(
     validation: TuningViews,
     share: Tensor,
     texels: Tensor,
-    coding: Cosines | Pages,
+    coding: TexelCoding,
     options: TuneOptions,
     progress: Progress,
 ) -> StoredTexels:

@@ -50,7 +50,7 @@ class TexelList:
     def projection(self, camera: Camera) -> Projection:
         """Project the surfels into a view."""
         geometry = (self.scene.surfels[name] for name in GEOMETRY)
-        return project(*geometry, camera.to(self.device), self.scene.near, alpha=self.alpha)
+        return project(*geometry, camera=camera.to(self.device), near=self.scene.near, alpha=self.alpha)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress) -> Tensor:
         """Measure every texel's coverage in unmasked pixels: [T, 2], the sums over views and fragments of the blending
@@ -104,7 +104,7 @@ class TuningViews(Sequence[TuningView]):
     def __len__(self) -> int:
         return len(self._views)
 
-    def __getitem__(self, index: int) -> TuningView:  # type: ignore[override]
+    def __getitem__(self, index: int) -> TuningView:
         if index in self._kept:
             return self._kept[index]
         view = self._traced(self._views[index])

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -95,11 +96,11 @@ def decoded_hash(info: Manifest, files: Mapping[str, bytes | bytearray]) -> str:
 
 
 def _compressed(
-    columns: Mapping[str, Codes], steps: Mapping[str, float], digest: Digest
+    columns: Mapping[str, npt.NDArray[np.integer]], steps: Mapping[str, float], digest: Digest
 ) -> tuple[list[dict[str, Any]], bytes]:
     """Compress columns; returns their entries in bundle.json and the bytes."""
     for values in columns.values():
-        digest.update(np.ascontiguousarray(values, "<i8"))
+        digest.update(np.ascontiguousarray(values, "<i8").data)
     found = {name: streams.compress(values) for name, values in columns.items()}
     entries = [{"name": name, "step": steps.get(name), "bytes": c.sizes} for name, c in found.items()]
     return entries, b"".join(c.data for c in found.values())
@@ -108,7 +109,7 @@ def _compressed(
 def _decompressed(data: memoryview, rows: int, column: ColumnEntry, digest: Digest | None, blocks: int = 0) -> Codes:
     codes = streams.decompress(data, rows, column.bytes, blocks)
     if digest is not None:
-        digest.update(np.ascontiguousarray(codes, "<i8"))
+        digest.update(np.ascontiguousarray(codes, "<i8").data)
     return codes
 
 
@@ -163,7 +164,7 @@ def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
     """Compute the layout of the tiles in pages, which follows from their sizes. Raises StreamError: the pages differ
     from those in bundle.json."""
     try:
-        packing = pack(sizes.numpy(), info.page_width, info.page_rows)
+        packing = pack(sizes.numpy(), info.page_width or 0, info.page_rows or 0)
     except ValueError as error:
         raise StreamError(str(error)) from error
     found = (packing.width, packing.height, packing.layers)

@@ -31,7 +31,7 @@ class _Layout:
 
 _RGBA = (0, 1, 2, 15)  # channel numbers of the colour model RGBSDA
 _FLOAT_SIGNED = 0xC0
-_LAYOUTS: dict[str, _Layout] = {
+_LAYOUTS: dict[Format, _Layout] = {
     "bc7": _Layout(145, 1, 4, 16, 134, ((0, 128, 0, 0, 0xFFFFFFFF),)),
     "uint8": _Layout(37, 1, 1, 4, 1, tuple((8 * i, 8, c, 0, 255) for i, c in enumerate(_RGBA))),
     "fp16": _Layout(
@@ -127,7 +127,7 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
     vk_format, type_size, width, height, depth, layers, faces, levels, scheme = fields[:9]
     dfd_at, dfd_size, kvd_at, kvd_size, sgd_at, sgd_size = fields[9:15]
     data_at, data_size, raw_size = fields[15:]
-    format = next((name for name, layout in _LAYOUTS.items() if layout.vk_format == vk_format), None)
+    format: Format | None = next((name for name, layout in _LAYOUTS.items() if layout.vk_format == vk_format), None)
     if format is None:
         raise Ktx2Error(f"the texel format {vk_format} is none of {[each.vk_format for each in _LAYOUTS.values()]}")
     layout = _LAYOUTS[format]

@@ -49,15 +49,15 @@ def _is_file_name(name: str) -> bool:
     return _FILE_NAME.fullmatch(name) is not None and name != MANIFEST
 
 
-def _only(value: float) -> Any:
-    """Build the type of a renderer constant, which is written for other programs; reading refuses any other value."""
+def _only(value: float) -> AfterValidator:
+    """Build the check of a renderer constant, which is written for other programs; reading refuses any other value."""
 
     def check(found: float) -> float:
         if found != value:
             raise PydanticCustomError("constant", "must be {value}, which is what is drawn with", {"value": value})
         return found
 
-    return Annotated[float, AfterValidator(check)]
+    return AfterValidator(check)
 
 
 def points_text(points: Tensor) -> str:
@@ -126,7 +126,7 @@ class Surfels(Part):
     columns: Annotated[list[ColumnEntry], Field(max_length=64)] | None = None  # of surfels.bin, in order
     view_color: Kind
     kernel: str = "min(alpha_max, opacity * max((1 - (u^2 + v^2) / support^2)+ ^ beta, exp(-low_pass * d^2)))"
-    support: _only(SUPPORT) = SUPPORT  # type: ignore[valid-type]
+    support: Annotated[float, _only(SUPPORT)] = SUPPORT
     residual: str = "of a surfel without a tile: residual_0..2, at weights of at least render.weight_bound"
     activations: dict[str, str] = ACTIVATIONS
     sites: Whole | None = None  # Spherical Voronoi sites per surfel, if all are kept
@@ -191,12 +191,12 @@ class AtlasEntry(Part):
 class RenderEntry(Part):
     """Constants of the renderers."""
 
-    alpha_max: _only(ALPHA_MAX) = ALPHA_MAX  # type: ignore[valid-type]
-    alpha_min: _only(ALPHA_MIN) = ALPHA_MIN  # type: ignore[valid-type]
-    t_min: _only(TRANSMITTANCE_MIN) = TRANSMITTANCE_MIN  # type: ignore[valid-type]
+    alpha_max: Annotated[float, _only(ALPHA_MAX)] = ALPHA_MAX
+    alpha_min: Annotated[float, _only(ALPHA_MIN)] = ALPHA_MIN
+    t_min: Annotated[float, _only(TRANSMITTANCE_MIN)] = TRANSMITTANCE_MIN
     near: Annotated[float, Field(ge=1e-9, le=1e6)]
     weight_bound: Share
-    low_pass: _only(1.0) = 1.0  # type: ignore[valid-type]
+    low_pass: Annotated[float, _only(1.0)] = 1.0
     prefilter: Literal["low_pass"] | None = None  # which earlier versions state
     photographed: Annotated[str, AfterValidator(_points)] | None = None
     """Points of the scene with the pixels per unit of length of their photographs (`points_text`)."""
@@ -225,7 +225,7 @@ class Manifest(Part):
     generator: str = "an unnamed program"
     surfels: Surfels
     atlas: AtlasEntry | None
-    color_bias: _only(COLOR_BIAS) = COLOR_BIAS  # type: ignore[valid-type]
+    color_bias: Annotated[float, _only(COLOR_BIAS)] = COLOR_BIAS
     render: RenderEntry
     world: WorldEntry
     bounds: Bounds
@@ -321,7 +321,7 @@ def _check_version(info: Mapping[str, Any], source: str) -> None:
         limit = f"this program reads up to {newest}.x: update bitymi-ns to open it"
         raise BundleError(f"{source} has version {version}, {limit}")
     file = surfels.get("file", SURFELS) if isinstance(surfels, dict) else None
-    if found[1] != newest and EARLIER.get(version) != file:
+    if found[1] != newest and EARLIER.get(found[0]) != file:
         raise BundleError(
             f"{source} has version {version} with {short(file)}, which is read no longer: export it again"
         )

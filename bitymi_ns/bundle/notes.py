@@ -12,7 +12,7 @@ from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.parts import NOTES, Parts, notes_data, parts_of
 from bitymi_ns.bundle.world import UNIT_LENGTH
 from bitymi_ns.ranges import first_problem
-from bitymi_ns.scene.crop import Box, Crop
+from bitymi_ns.scene.crop import Box, Crop, vector
 
 NEWEST = 2  # version; the page writes 1 where nothing of version 2 is used
 SINCE_2 = ("measures", "unit", "crop", "hidden")
@@ -144,8 +144,8 @@ class Notes(_Strict):
     def cropping(self) -> Crop:
         """Surfels to hide."""
         box, floor = (None, None) if self.crop is None else (self.crop.box, self.crop.floor)
-        plane = None if floor is None else (tuple(floor.normal), floor.offset)
-        return Crop(None if box is None else _box(box), plane, tuple(map(_box, self.hidden)))  # type: ignore[arg-type]
+        plane = None if floor is None else (vector(floor.normal), floor.offset)
+        return Crop(None if box is None else _box(box), plane, tuple(map(_box, self.hidden)))
 
 
 def _box(entry: OrientedBox) -> Box:

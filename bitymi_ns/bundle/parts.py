@@ -6,8 +6,9 @@ import struct
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from io import BufferedReader
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import NamedTuple
 
 from bitymi_ns import safe_reading
 from bitymi_ns.bundle.manifest import (
@@ -61,7 +62,7 @@ def public_manifest(info: Manifest, data: bytes) -> bytes:
     return dump(info.model_copy(update={"files": {name: e for name, e in info.files.items() if is_known(name)}}))
 
 
-def open_regular(path: Path) -> BinaryIO:
+def open_regular(path: Path) -> BufferedReader:
     """Open a file of a bundle for reading with `safe_reading.open_regular`. Raises BundleError: missing, not a regular
     file, or the system refuses it."""
     try:
@@ -83,7 +84,7 @@ class _Entry(NamedTuple):
 class Parts:
     """Files of a bundle by name."""
 
-    def __init__(self, bundle: Path, file: BinaryIO | None = None, inside: bool = False) -> None:
+    def __init__(self, bundle: Path, file: BufferedReader | None = None, inside: bool = False) -> None:
         """Prefer `parts_of`.
 
         Args:
@@ -95,7 +96,7 @@ class Parts:
         self._entries, self._end = ({}, 0) if file is None else _read_directory(file)
 
     @contextmanager
-    def opened(self, name: str) -> Iterator[tuple[BinaryIO, int]]:
+    def opened(self, name: str) -> Iterator[tuple[BufferedReader, int]]:
         """Open a file; yield it, at its beginning, and its size in bytes, at most so many of which may be read. Raises
         BundleError: missing or unreadable."""
         path = self.bundle / name
@@ -110,7 +111,7 @@ class Parts:
         except OSError as error:
             raise BundleError(f"{path} cannot be read: {error.strerror}") from error
 
-    def _seek(self, file: BinaryIO, name: str) -> int:
+    def _seek(self, file: BufferedReader, name: str) -> int:
         """Move to the beginning of a part of the single file, and return its size."""
         if name not in self._entries:
             raise MissingPart(f"{self.bundle} has no {name}")
@@ -160,7 +161,7 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
         yield parts
 
 
-def _read_directory(file: BinaryIO) -> tuple[dict[str, _Entry], int]:
+def _read_directory(file: BufferedReader) -> tuple[dict[str, _Entry], int]:
     """Read the directory of a single file as web/src/bundle/archive.ts does: by name where the parts are said to be;
     and where it begins. Hashes in bundle.json decide whether the parts are whole. Raises ValueError: there is none, or
     the file does not begin with the first part, and could be of another type, too."""

@@ -6,8 +6,9 @@ import hashlib
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
@@ -195,7 +196,7 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
     return data
 
 
-def _read_whole(file: BinaryIO, head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
+def _read_whole(file: BufferedReader, head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
     """Read a file of `size` bytes, of which `head` is read already, and feed them to `sha256`; return them if `keep`,
     else nothing."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
@@ -205,7 +206,7 @@ def _read_whole(file: BinaryIO, head: bytes, size: int, keep: bool, path: Path, 
         sha256.update(head)
     while at < size:
         window = view[at : at + _CHUNK] if keep else view[: min(_CHUNK, size - at)]
-        count = file.readinto(window)  # type: ignore[attr-defined]
+        count = file.readinto(window)
         if not count:
             raise BundleError(f"{path} is truncated: it ended after {at} bytes while it was read")
         if sha256 is not None:

@@ -92,7 +92,7 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
     if scene.mean_residual is not None:
         residual = _plain(scene.mean_residual).numpy()
         columns |= {name: residual[:, i] for i, name in enumerate(COLUMNS["mean_residual"])}
-    if has_alpha:
+    if has_alpha and scene.mean_alpha is not None:
         columns[ALPHA_COLUMN] = _plain(scene.mean_alpha).numpy()
     return columns
 
@@ -217,7 +217,8 @@ def _lean_from_columns(
     if ((count < 0) | (count > MAX_TERMS)).any() or int(count.sum()) != len(terms[names[0]]):
         raise PlyError(f"{COUNT_COLUMN} does not count the {len(terms[names[0]])} rows of {TERMS}")
     span = torch.stack([count.cumsum(0) - count, count], dim=1).int()
-    lean = dict(zip(LEAN, (_stack(columns, _numbered("view_base", 3)), span, _stack(terms, names)), strict=True))
+    values = (_stack(columns, _numbered("view_base", 3)), span, _stack(terms, names))
+    lean: dict[str, Tensor] = dict(zip(LEAN, values, strict=True))
     try:
         check_lean(kind, lean, len(count))
     except ValueError as error:

@@ -89,7 +89,7 @@ def check_world(stated: WorldEntry, world: World) -> Check:
     wrong = []
     for key, found in world.described().items():
         value = getattr(stated, key)
-        if value is None and key not in ("transform", "scale"):
+        if value is None:
             continue
         same = value == found if isinstance(found, str) else np.allclose(value, found, rtol=1e-4, atol=1e-5)
         wrong += [] if same else [f"{key} is {value}, that of the run {found}"]

@@ -144,8 +144,9 @@ def photographs_of(source: Source) -> list[Photograph]:
     model, found = source.model, []
     for image, file in zip(model.images, source.files(), strict=True):
         w, *xyz = image.qvec / np.linalg.norm(image.qvec)
-        to_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*xyz, w])), image.tvec).inverse().matrix()
-        pose = TO_Z_UP @ np.concatenate([to_world, [[0.0, 0.0, 0.0, 1.0]]]) @ OPENCV_AXES
+        pose: Pose = np.eye(4)
+        pose[:3] = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*xyz, w])), image.tvec).inverse().matrix()
+        pose = TO_Z_UP @ pose @ OPENCV_AXES
         label = f"camera {image.camera_id} of {source.folder}"
         found.append(Photograph(file, model.cameras[image.camera_id], pose, label, frame=image.frame))
     return found

@@ -4,8 +4,9 @@ import math
 import os
 import threading
 from collections.abc import Callable, Sequence
+from operator import attrgetter
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 from zipfile import ZipFile
 
 import cv2
@@ -33,7 +34,7 @@ EXR_ATTRIBUTES = ("channels", "compression", "dataWindow", "displayWindow", "lin
 Check = Callable[[tuple[int, ...]], None]  # receives a header's shape, and raises if it must not be read
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 # a damaged map gets one message, without OpenCV's
-(getattr(cv2, "setLogLevel", None) or cv2.utils.logging.setLogLevel)(0)
+attrgetter("setLogLevel" if hasattr(cv2, "setLogLevel") else "utils.logging.setLogLevel")(cv2)(0)
 _PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
 
 Values = npt.NDArray[np.float32]
@@ -73,7 +74,7 @@ def _is_color(path: Path) -> bool:
     return values is not None and values.ndim == 3 and values.dtype.kind in "iu" and _channels_differ(values)
 
 
-def _channels_differ(values: npt.NDArray[np.generic]) -> bool:
+def _channels_differ(values: npt.NDArray[Any]) -> bool:
     return not bool((values[..., :3] == values[..., :1]).all())
 
 
@@ -114,7 +115,7 @@ def read_normal(files: MapFiles, lens: Lens) -> Values:
 _WITHOUT = "Write it again, or train without: `bitymi-data --depth off`."
 
 
-def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.NDArray[np.generic]:
+def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.NDArray[Any]:
     """Read an array [H, W] or [H, W, C] of RGB order, after checking its header against the photograph's width and
     height, and against its shape if `alike`."""
 
@@ -145,7 +146,7 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
     return values.astype(np.float32) if values.dtype.itemsize > 4 or values.dtype == np.float16 else values
 
 
-def _read_by_opencv(path: Path, check: Check) -> npt.NDArray[np.generic]:
+def _read_by_opencv(path: Path, check: Check) -> npt.NDArray[Any]:
     check(image_shape(path))
     values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if values is None:
@@ -153,7 +154,7 @@ def _read_by_opencv(path: Path, check: Check) -> npt.NDArray[np.generic]:
     return values if values.ndim == 2 else values[..., 2::-1]  # BGR, BGRA
 
 
-def _read_exr(path: Path, check: Check) -> npt.NDArray[np.generic]:
+def _read_exr(path: Path, check: Check) -> npt.NDArray[Any]:
     import OpenEXR  # OpenCV 5 reads no such files, and 4 reads a channel Z as zeros
 
     with open_regular(path) as file:
@@ -184,7 +185,7 @@ def _check_exr_header(file: IO[bytes]) -> None:
         raise ValueError(f"its header has no {missing[0]}")
 
 
-def read_array(path: Path, check: Check) -> npt.NDArray[np.generic]:
+def read_array(path: Path, check: Check) -> npt.NDArray[Any]:
     """Read a .npy file, or the first array of a .npz file, if `check` passes. Raises OSError, ValueError: it cannot be
     read, is no array of numbers, or is cut off."""
     with open_regular(path) as file:
@@ -194,7 +195,7 @@ def read_array(path: Path, check: Check) -> npt.NDArray[np.generic]:
             return _array(part, check)
 
 
-def _array(file: IO[bytes], check: Check) -> npt.NDArray[np.generic]:
+def _array(file: IO[bytes], check: Check) -> npt.NDArray[Any]:
     version = np.lib.format.read_magic(file)
     if version not in ((1, 0), (2, 0)):
         raise ValueError(f"it is of version {version[0]} of the format, which is for tables")

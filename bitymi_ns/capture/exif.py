@@ -4,6 +4,7 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from PIL import ExifTags, Image
 
@@ -45,17 +46,18 @@ def read_exif(image: Image.Image) -> Exif:
     return Exif(" ".join(parts), focal, doubt, _position(gps), time, _up(image, tags, detail))
 
 
-def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[float | None, str]:
+def focal_length(detail: Mapping[int, Any], size: tuple[int, int]) -> tuple[float | None, str]:
     """Compute the focal length in pixels from the Exif IFD and the stored size, and why a stated one is not used."""
     long, short = max(size), min(size)
     film = number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     millimetres = number(detail.get(ExifTags.Base.FocalLength))
     density = number(detail.get(ExifTags.Base.FocalPlaneXResolution))
     unit = {2: 25.4, 3: 10.0, 4: 1.0}.get(int(number(detail.get(ExifTags.Base.FocalPlaneResolutionUnit)) or 2), 25.4)
-    stated = [number(detail.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)]
+    sides = (number(detail.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight))
+    stated = [side for side in sides if side]
     if not film and not (millimetres and density):
         return None, ""
-    if all(stated):
+    if len(stated) == 2:
         there, was = long / short, max(stated) / min(stated)
         if abs(there / was - 1) > SAME_ASPECT:
             return None, f"cropped: {long} x {short} pixels of {max(stated):.0f} x {min(stated):.0f}"
@@ -66,16 +68,16 @@ def focal_length(detail: Mapping[int, object], size: tuple[int, int]) -> tuple[f
     if film:
         pixels = film / FULL_FRAME_DIAGONAL * math.hypot(long, short)
     else:
-        pixels = millimetres * density / unit * long / max(stated)
+        pixels = (millimetres or 0.0) * (density or 0.0) / unit * long / max(stated)
     if not FOCAL_RANGE[0] * long <= pixels <= FOCAL_RANGE[1] * long:
         return None, f"{pixels:.0f} pixels cannot be meant for an image {long} pixels long"
     return pixels, ""
 
 
-def number(value: object) -> float | None:
+def number(value: Any) -> float | None:
     """Convert to a positive finite number, or None: files hold text and rationals with a denominator of 0."""
     try:
-        found = float(value)  # type: ignore[arg-type]
+        found = float(value)
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return found if math.isfinite(found) and found > 0 else None
@@ -114,9 +116,7 @@ def exif_stops(seconds: float, f_number: float, iso: float) -> float:
     return math.log2(seconds * iso / (f_number * f_number))
 
 
-def _up(
-    image: Image.Image, tags: Mapping[int, object], detail: Mapping[int, object]
-) -> tuple[float, float, float] | None:
+def _up(image: Image.Image, tags: Mapping[int, Any], detail: Mapping[int, Any]) -> tuple[float, float, float] | None:
     """Find up from a phone's accelerometer; None = none stated, the phone moved, or the picture is turned otherwise."""
     note = detail.get(ExifTags.Base.MakerNote)
     if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
@@ -155,17 +155,17 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
     return None
 
 
-def _position(gps: Mapping[int, object]) -> tuple[float, float, float] | None:
+def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     """Read latitude, longitude and altitude; None unless the first two are plausible."""
     try:
         angles = []
         for tag, reference, limit in ((2, 1, 90), (4, 3, 180)):
-            degrees, minutes, seconds = (float(part) for part in gps[tag])  # type: ignore[attr-defined]
+            degrees, minutes, seconds = (float(part) for part in gps[tag])
             angle = degrees + minutes / 60 + seconds / 3600
             if not angle <= limit:
                 return None
             angles.append(-angle if str(gps.get(reference, "")).strip("\0 ").upper() in ("S", "W") else angle)
-        height = float(gps.get(6, 0.0))  # type: ignore[arg-type]
+        height = float(gps.get(6, 0.0))
         below = gps.get(5) in (1, b"\x01")
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         return None

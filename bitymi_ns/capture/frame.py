@@ -148,6 +148,8 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
         if 2 * (errors <= error).sum() >= len(errors):
             agree = errors <= 2 * error  # with those that noise puts farther away
             similarity = pycolmap.estimate_sim3d(centers[agree], positions[agree])
+            if similarity is None:
+                return None
             same_shape = np.median(_gps_errors(similarity, centers, positions)[agree]) < SAME_SHAPE * spread[0]
             return (similarity, agree) if same_shape else None
     warn(f"GPS is not used: fewer than half of {len(positions)} photographs agree on it to {AGREEMENTS[-1]:g} m.")
@@ -158,17 +160,18 @@ def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray |
     """Make the similarity that turns `up` (None = the cameras' mean) to z, moves the cameras' mean position to the
     origin, and scales their mean distance from it to 1."""
     turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
-    if up is None:
-        up = -np.mean([turn[1] for turn in turns], axis=0)
-        if np.linalg.norm(up) < 0.1:  # the cameras' ups cancel
-            up = -turns[0][1]
-        up /= np.linalg.norm(up)
+    axis = up
+    if axis is None:
+        axis = -np.mean([turn[1] for turn in turns], axis=0)
+        if np.linalg.norm(axis) < 0.1:  # the cameras' ups cancel
+            axis = -turns[0][1]
+        axis /= np.linalg.norm(axis)
     side = np.mean([turn[0] for turn in turns], axis=0)
-    side -= up * (up @ side)
+    side -= axis * (axis @ side)
     if np.linalg.norm(side) < 1e-3:
-        side = np.cross(up, [1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0])
+        side = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])
     side /= np.linalg.norm(side)
-    turn = np.stack([side, np.cross(up, side), up])
+    turn = np.stack([side, np.cross(axis, side), axis])
     middle = centers.mean(axis=0)
     size = float(np.mean(np.linalg.norm(centers - middle, axis=1)))
     scale = 1.0 / size if size > 0 else 1.0

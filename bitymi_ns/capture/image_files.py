@@ -18,7 +18,8 @@ from bitymi_ns.capture.exif import exif_stops, exposure_settings
 from bitymi_ns.capture.folder_contents import open_picture
 from bitymi_ns.capture.types import Photograph, fail, parsing
 
-S, T = TypeVar("S"), TypeVar("T")
+S = TypeVar("S")
+T = TypeVar("T")
 MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
 THREADS = 4
 PROPORTIONS = 0.02  # relative difference of aspect ratios by rounding
@@ -80,7 +81,9 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
     kinds = [None if each is None else tuple(value is not None for value in each) for each in found]
     usual = Counter(kind for kind in kinds if kind is not None).most_common(1)
     return [
-        exif_stops(*(value or 1.0 for value in each)) if usual and kind == usual[0][0] else math.nan
+        exif_stops(*(value or 1.0 for value in each))
+        if each is not None and usual and kind == usual[0][0]
+        else math.nan
         for each, kind in zip(found, kinds, strict=True)
     ]
 
@@ -176,7 +179,7 @@ _REPLACE = "Replace it or remove it from the capture."
 _WORDED = (FileNotFoundError, Image.DecompressionBombError)
 
 
-def wrong_size(path: Path, size: tuple[int, int], declared: tuple[int, int], camera: str = "its camera") -> str:
+def wrong_size(path: Path | None, size: tuple[int, int], declared: tuple[int, int], camera: str = "its camera") -> str:
     """Explain that an image's `size` (width, height) is not the one `declared` by its camera."""
     shown = f"{size[0]} x {size[1]} pixels, but {camera} is for {declared[0]} x {declared[1]}"
     if size == declared[::-1]:

@@ -37,6 +37,7 @@ ANGLES, AZIMUTHS = 360, 64  # rays for testing where the distortion folds the pi
 SAMPLES = 2  # samples along a side of a face's pixel: one would alias where photographs are denser, as at their poles
 BAND = 256  # rows of a face that are resampled together
 PAD = 2  # columns by which a 360-degree picture is continued at each side, from the other side
+NO_MAP = np.empty(0, np.float32)  # for OpenCV, where the first map has both coordinates
 CACHED_MAPS = 4  # lenses whose remapping tables are cached; 72 MB for 12 megapixels
 ABSURD_AREA = 0.05  # fail if undistorting leaves a smaller share of the photograph
 
@@ -115,7 +116,7 @@ class Lens:
         pixels = self.undistort_map(np.asarray(mask).astype(np.uint8), path)
         return Image.fromarray(pixels.astype(bool) & self.coverage)
 
-    def undistort_map(self, values: npt.NDArray[Any], path: Path) -> npt.NDArray[Any]:
+    def undistort_map(self, values: npt.NDArray[Any], path: Path | None) -> npt.NDArray[Any]:
         """Undistort uint8 or float32 values [H, W] or [H, W, C] by nearest neighbors; sizes as for masks."""
         size = (values.shape[1], values.shape[0])
         if not in_proportion(size, self.stored):
@@ -144,8 +145,9 @@ class Lens:
             rows = min(BAND, to.height - start)
             y = (start + (np.arange(rows * samples) + 0.5) / samples - to.cy) / to.fy
             rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1).reshape(-1, 3) @ FACES[self.face]
-            at = lens.img_from_cam(rays).astype(np.float32).reshape(len(y), len(x), 2) + np.float32([pad - 0.5, -0.5])
-            band = cv2.remap(pixels, at, None, how, borderMode=cv2.BORDER_REPLICATE)
+            at = self.camera.pixels_of(rays).astype(np.float32).reshape(len(y), len(x), 2)
+            at += np.array([pad - 0.5, -0.5], np.float32)
+            band = cv2.remap(pixels, at, NO_MAP, how, borderMode=cv2.BORDER_REPLICATE)
             bands.append(band if nearest else cv2.resize(band, (to.width, rows), interpolation=cv2.INTER_AREA))
         return np.concatenate(bands)
 
@@ -277,17 +279,17 @@ def _largest(fits: Callable[[float], bool]) -> float:
 
 
 @lru_cache(maxsize=CACHED_MAPS)
-def _maps(lens: Lens) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16]]:
-    """Compute fixed-point maps for cv2.remap: positions in the photograph of the result's pixels."""
+def _maps(lens: Lens) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+    """Compute fixed-point maps (int16, uint16) for cv2.remap: positions in the photograph of the result's pixels."""
     to = lens.pinhole
     x, y = (np.arange(0, size + NODE_STEP, NODE_STEP) + 0.5 for size in (to.width, to.height))
     rays = np.stack(np.meshgrid((x - to.cx) / to.fx, (y - to.cy) / to.fy), -1).reshape(-1, 2)
-    nodes = lens.camera.colmap.img_from_cam(np.concatenate([rays, np.ones((len(rays), 1))], 1)) - 0.5
+    nodes = lens.camera.pixels_of(np.concatenate([rays, np.ones((len(rays), 1))], 1)) - 0.5
     nodes = nodes.reshape(len(y), len(x), 2).astype(np.float32)
     scale = np.array([[1.0 / NODE_STEP, 0.0, 0.0], [0.0, 1.0 / NODE_STEP, 0.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     whole = cv2.warpAffine(nodes, scale, (to.width, to.height), flags=flags, borderMode=cv2.BORDER_REPLICATE)
-    return cv2.convertMaps(whole, None, cv2.CV_16SC2)
+    return cv2.convertMaps(whole, NO_MAP, cv2.CV_16SC2)
 
 
 def covered(camera: ColmapCamera, face: str, rays: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
@@ -297,7 +299,7 @@ def covered(camera: ColmapCamera, face: str, rays: npt.NDArray[np.float64]) -> n
     directions = (rays @ FACES[face]).reshape(-1, 3)
     near = directions[:, 2] > np.linalg.norm(directions, axis=1) * math.cos(_field(camera))
     pixels = np.full((len(directions), 2), np.nan)
-    pixels[near] = camera.colmap.img_from_cam(directions[near])
+    pixels[near] = camera.pixels_of(directions[near])
     with np.errstate(invalid="ignore"):
         return ((pixels >= 0.0) & (pixels <= camera.size)).all(1).reshape(rays.shape[:-1])
 
@@ -310,7 +312,7 @@ def _field(camera: ColmapCamera) -> float:
     azimuths = np.linspace(0.0, 2.0 * np.pi, AZIMUTHS, endpoint=False)
     angle, azimuth = np.meshgrid(angles, azimuths, indexing="ij")
     rays = np.stack([np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth), np.cos(angle)], -1)
-    pixels = lens.img_from_cam(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
+    pixels = camera.pixels_of(rays.reshape(-1, 3)).reshape(*rays.shape[:2], 2)
     away = np.linalg.norm(pixels - (lens.principal_point_x, lens.principal_point_y), axis=-1)
     outwards = (np.diff(away, axis=0, prepend=0.0) > 0.0).all(1)
     return float(MAX_ANGLE if outwards.all() else angles[max(0, int(outwards.argmin()) - 1)])

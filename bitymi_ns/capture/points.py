@@ -52,7 +52,7 @@ def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.ND
     white = next((white for white in ((1.0, 255.0) if floating else (255.0, 65535.0)) if high <= white), None)
     if white is None or low < 0.0:
         return none, f"its colors lie between {low:g} and {high:g}, which is neither 0 to 1 nor 0 to 255 nor 0 to 65535"
-    return np.uint8(values * (255.0 / white) + 0.5), ""
+    return (values * (255.0 / white) + 0.5).astype(np.uint8), ""
 
 
 def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:

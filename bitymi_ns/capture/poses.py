@@ -253,8 +253,8 @@ def camera_group(photos: Sequence[Photo], names: list[str], options: SfmOptions)
     width, height = photos[0].width, photos[0].height
     if photos[0].panorama:
         return CameraGroup(ColmapCamera(SPHERICAL_MODEL, width, height, (float(width), float(height))), True, names)
-    stated = [photo.exif.focal_length for photo in photos]
-    focal = options.focal_length or (statistics.median(stated) if all(stated) else None)
+    stated = [photo.exif.focal_length for photo in photos if photo.exif.focal_length]
+    focal = options.focal_length or (statistics.median(stated) if len(stated) == len(photos) else None)
     model = "SIMPLE_RADIAL" if options.camera_model == "auto" else options.camera_model
     start = focal or GUESSED_FOCAL * max(width, height)
     camera = pycolmap.Camera.create_from_model_name(0, model, start, width, height)

@@ -228,7 +228,7 @@ class _Reader:
             hint = f"Put it there again, or remove ply_file_path from {read.path} to start from random points."
             path = found.folder / meta["ply_file_path"]
             own = self._colored(*read_cloud(path, hint), photographs, path)
-        elif model is not None:
+        elif model is not None and applied is not None:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
         scale = float(meta.get("applied_scale", 1.0))
         points = self._points(own, photographs, source)

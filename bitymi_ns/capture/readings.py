@@ -140,7 +140,7 @@ def match_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
 def _features(photograph: Photograph) -> Features:
     """Find SIFT features, the largest first, with square roots of the histograms as descriptors (Arandjelovic and
     Zisserman, 2012); none if the photograph cannot be read, or not with its camera, which is reported later."""
-    camera, found, mask = photograph.camera, (), None
+    camera, found, mask = photograph.camera, (), np.empty(0, np.uint8)
     side = SIDE * (2 if camera.model == SPHERICAL_MODEL else 1)
     size = camera.within(side)
     with suppress(CaptureError):
@@ -148,7 +148,7 @@ def _features(photograph: Photograph) -> Features:
         if photograph.mask is not None:
             mask = np.asarray(checked_mask(photograph.mask).resize(size), np.uint8)
         if in_proportion(image_size(photograph.file) or (0, 1), camera.size):
-            found, values = cv2.SIFT_create(FEATURES, contrastThreshold=0.02).detectAndCompute(image, mask)
+            found, values = cv2.SIFT.create(FEATURES, contrastThreshold=0.02).detectAndCompute(image, mask)
     if not found:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
     largest = np.argsort([-each.size for each in found], kind="stable")

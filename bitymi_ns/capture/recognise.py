@@ -65,12 +65,12 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         fail(why)
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
-    fitting = [each for each in candidates if format in ("auto", each[0])]
+    fitting: list[tuple[Format, Path]] = [each for each in candidates if format in ("auto", each[0])]
     if data.is_dir() and all(found in ("photographs", "video") for found, _ in fitting):
         if (within := _capture_within(data, format)) is not None:
             return recognise(within, format)
     twins: dict[str, Format] = {"instant-ngp": "nerfstudio", "nerfstudio": "instant-ngp"}
-    if format in twins and not fitting:  # the user knows better than the entries of the file
+    if format != "auto" and format in twins and not fitting:  # the user knows better than the entries of the file
         fitting = [(format, path) for found, path in candidates if found == twins[format]]
     if not fitting:
         fail(_nothing(data, format, candidates))
@@ -116,7 +116,8 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     photographs = _photographs_in(folder)
     if photographs is not None:
         yield "photographs", photographs
-    yield from (("video", video) for video in folder_contents.videos_in(folder))
+    for video in folder_contents.videos_in(folder):
+        yield "video", video
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:

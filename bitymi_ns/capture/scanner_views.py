@@ -114,7 +114,7 @@ def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
             continue
         with parsing(path, AGAIN):
             values = read_json(path)
-            pose = np.array(_numbers(values["cameraPoseARFrame"], 16)).reshape(4, 4)
+            pose: Pose = np.array(_numbers(values["cameraPoseARFrame"], 16)).reshape(4, 4)
             fx, _, cx, _, fy, cy, *_ = _numbers(values["intrinsics"], 9)
         number = path.stem.removeprefix("frame_")
         maps = maps_called(folder, f"depth_{number}", f"conf_{number}")

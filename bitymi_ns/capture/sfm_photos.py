@@ -161,7 +161,7 @@ def is_plain(image: Image.Image, path: Path) -> bool:
 
 def _reduced(image: Image.Image, size: int) -> Image.Image:
     scale = min(1.0, size / max(image.size))
-    return image.resize((max(1, round(image.width * scale)), max(1, round(image.height * scale))), Image.BOX)
+    return image.resize((max(1, round(image.width * scale)), max(1, round(image.height * scale))), Image.Resampling.BOX)
 
 
 def sharpness(grey: np.ndarray) -> float:

@@ -82,7 +82,7 @@ def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: S
     of_first = [names[i] for i in groups]
     split = by_mode(of_first, options.eval_mode, options.eval_interval, options.train_split_fraction)
     sides = ([groups[i] for i in side] for side in (split.train, split.held_out))
-    return split_members(Split(*sides, split.rule), frames)
+    return split_members(Split(*sides, rule=split.rule), frames)
 
 
 def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -> Split:

@@ -177,7 +177,7 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
     """Convert an entry, also in quotes, to a number. Raises CaptureError: it is none, or no number of pixels (w, h)."""
     try:
-        number = float(None if isinstance(value, bool) else value)  # type: ignore[arg-type]
+        number = float("" if isinstance(value, bool) else value)
     except (TypeError, ValueError, OverflowError):
         fail(f"{path}: {key} {label} is {value!r}, which is no number")
     if key not in ("w", "h"):

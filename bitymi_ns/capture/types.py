@@ -4,7 +4,7 @@ import logging
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, NoReturn
 
 import numpy as np
 import numpy.typing as npt
@@ -79,6 +79,12 @@ class ColmapCamera(NamedTuple):
         from bitymi_ns.capture import pycolmap  # slow, and not needed for options
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
+
+    def pixels_of(self, points: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
+        """Project points [n, 3] in the camera's frame to pixels [n, 2]."""
+        pixels = self.colmap.img_from_cam(points)
+        assert pixels is not None  # as for a single point that has none
+        return pixels
 
     def within(self, side: int) -> tuple[int, int]:
         """Return the size of pictures reduced to at most `side` pixels along the longer side."""

@@ -10,6 +10,7 @@ from pathlib import Path
 import av
 import numpy as np
 import numpy.typing as npt
+from av.container import InputContainer
 from PIL import Image, ImageOps
 
 from bitymi_ns.capture.cache import content_key, made_once
@@ -147,7 +148,7 @@ def displacement(first: np.ndarray, second: np.ndarray) -> float:
             at = np.array(np.unravel_index(peak.argmax(), peak.shape))
             shift = [_between(peak[:, at[1]], at[0]), _between(peak[at[0]], at[1])]
             shift = [s - side if s > side / 2 else s for s, side in zip(shift, window.shape, strict=True)]
-            lengths.append(float(np.hypot(*shift)))
+            lengths.append(float(np.hypot(shift[0], shift[1])))
     return float(np.mean(lengths)) / max(first.shape)
 
 
@@ -169,12 +170,12 @@ def _pace(video: Path) -> tuple[float, float, int]:
         return gap - 0.5 * min(gap, 1.0 / rate), rate, total  # the nearest frame to the due time, not the next one
 
 
-def _opened(video: Path) -> av.container.InputContainer:
+def _opened(video: Path) -> InputContainer:
     try:
         open_regular(video).close()
         container = av.open(os.path.abspath(video), options=TRUSTED)  # a relative path may begin like a URL
     except (av.FFmpegError, OSError, ValueError) as error:
-        reason = error.strerror or error
+        reason = getattr(error, "strerror", None) or error
         raise CaptureError(f"{video} cannot be read as a video ({reason}): record or export it again") from error
     if not container.streams.video:
         container.close()
@@ -182,9 +183,10 @@ def _opened(video: Path) -> av.container.InputContainer:
     return container
 
 
-def _pictures(container: av.container.InputContainer) -> av.VideoStream:
+def _pictures(container: InputContainer) -> av.VideoStream:
     """Choose the video stream, not a cover picture."""
-    return container.streams.best("video") or container.streams.video[0]
+    best = container.streams.best("video")
+    return best if isinstance(best, av.VideoStream) else container.streams.video[0]
 
 
 def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame]]:

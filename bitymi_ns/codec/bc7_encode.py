@@ -3,12 +3,14 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 Profile = Literal["slow", "basic", "fast", "veryfast", "ultrafast"]
+AlphaProfile = Literal["alpha_slow", "alpha_basic", "alpha_fast", "alpha_veryfast", "alpha_ultrafast"]
+WITH_ALPHA: dict[Profile, AlphaProfile] = dict(zip(get_args(Profile), get_args(AlphaProfile), strict=True))
 
 STRIP = 64  # rows per encoder call: enough calls for all threads and for progress
 
@@ -24,9 +26,9 @@ def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[
             "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp` (Python 3.11 or later), or choose another "
             "format"
         ) from error
-    if profile not in ("slow", "basic", "fast", "veryfast", "ultrafast"):
+    if profile not in WITH_ALPHA:
         raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")
-    settings = ispc_texcomp.BC7EncSettings.from_profile(f"alpha_{profile}" if alpha else profile)
+    settings = ispc_texcomp.BC7EncSettings.from_profile(WITH_ALPHA[profile] if alpha else profile)
 
     def compress(rgba: npt.NDArray[np.uint8]) -> bytes:
         height, width = rgba.shape[:2]

@@ -4,12 +4,10 @@ They lie far beyond what training reaches (an optimiser moves a parameter by at 
 keep every number of a renderer finite and every channel of a picture at most `BRIGHTEST`.
 """
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.parameters import Limit
+from bitymi_ns.ops.parameters import Limit, Tensors
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, PARAMETERS, VIEW_COLORS
 
 RESIDUAL_LIMIT = 256.0  # largest absolute value of a residual colour
@@ -43,7 +41,7 @@ def beyond(name: str, kind: str, values: Tensor) -> Tensor:
     )
 
 
-def within(surfels: Mapping[str, Tensor], kind: str) -> Tensor:
+def within(surfels: Tensors, kind: str) -> Tensor:
     """Compute the mask [N] of surfels whose parameters ([N, ...] each) all keep their limits."""
     bad = [beyond(name, kind, value.detach()) for name, value in surfels.items()]
     return ~torch.stack([each.flatten(1).any(1) if each.dim() > 1 else each for each in bad]).any(0)

@@ -212,7 +212,7 @@ def _errors(values: npt.NDArray[np.float32], decoded: npt.NDArray[np.float32], v
     return clipped, float(np.square(decoded.astype(np.float64) - values).sum())
 
 
-def decode_pages(payload: Sequence[bytes], format: Format, width: int, height: int) -> np.ndarray:
+def decode_pages(payload: Sequence[bytes | memoryview], format: Format, width: int, height: int) -> np.ndarray:
     """Decode an atlas's pages to stored texels [layers, height, width, 4]: uint8 for bc7 and uint8, float16 for fp16.
     Raises ValueError: a page has the wrong number of bytes."""
     dtype = np.float16 if format == "fp16" else np.uint8

@@ -196,7 +196,8 @@ def term_numbers(kind: str) -> tuple[list[int], list[int]]:
 
 def morton_codes(cell: Codes) -> Codes:
     """Interleave cells [N, 3], below 2^17 per axis, to Morton codes [N]."""
-    return sum(((cell[:, a] >> i) & 1) << (3 * i + a) for i in range(POSITION_BITS) for a in range(3))
+    bits = (((cell[:, a] >> i) & 1) << (3 * i + a) for i in range(POSITION_BITS) for a in range(3))
+    return sum(bits, start=np.zeros(len(cell), np.int64))
 
 
 def morton_cells(codes: Codes) -> Codes:
@@ -212,8 +213,8 @@ def _grid_cells(means: npt.NDArray[np.float64], step: float) -> tuple[PositionGr
     bent = np.arcsinh((means - center) / scale)
     low = bent.min(axis=0)
     step = max(step, float((bent.max(axis=0) - low).max()) / (2**POSITION_BITS - 1))
-    frame = PositionGrid(tuple(map(float, center)), scale, tuple(map(float, low)))  # type: ignore[arg-type]
-    return frame, step, np.rint((bent - low) / step).astype(np.int64)
+    (x, y, z), (low_x, low_y, low_z) = center.tolist(), low.tolist()
+    return PositionGrid((x, y, z), scale, (low_x, low_y, low_z)), step, np.rint((bent - low) / step).astype(np.int64)
 
 
 def _term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -7,6 +7,9 @@ import torch
 import trimesh
 from PIL import Image
 from torch import Tensor
+from trimesh.exchange.gltf import export_glb
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from bitymi_ns.interchange.quads import MASK, Quads
 from bitymi_ns.interchange.triangles import Triangles
@@ -40,11 +43,11 @@ def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
         mesh = trimesh.Trimesh(
             quads.corners[rows].reshape(-1, 3).numpy(),
             (4 * np.arange(len(rows))[:, None, None] + np.array(_FACES)).reshape(-1, 3),
-            visual=trimesh.visual.TextureVisuals(uv=uv, material=material),
+            visual=TextureVisuals(uv=uv, material=material),
             process=False,
         )
         scene.add_geometry(mesh, node_name=f"surfels-{page}", geom_name=f"surfels-{page}", transform=place)
-    return trimesh.exchange.gltf.export_glb(scene, include_normals=False, tree_postprocessor=_unlit)
+    return export_glb(scene, include_normals=False, tree_postprocessor=_unlit)
 
 
 def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> bytes:
@@ -56,16 +59,16 @@ def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> byte
         mesh.faces,
         vertex_normals=normals,
         vertex_attributes={_COLOR: linear.clip(0.0, 1.0).astype(np.float32)},
-        visual=trimesh.visual.TextureVisuals(material=_matte()),
+        visual=TextureVisuals(material=_matte()),
         process=False,
     )
     scene = trimesh.Scene()
     scene.add_geometry(shape, node_name="surface", geom_name="surface", transform=place)
-    return trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=_colored)
+    return export_glb(scene, include_normals=True, tree_postprocessor=_colored)
 
 
-def _matte(**more: Any) -> trimesh.visual.material.PBRMaterial:
-    return trimesh.visual.material.PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True, **more)
+def _matte(**more: Any) -> PBRMaterial:
+    return PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True, **more)
 
 
 def _colored(tree: dict[str, Any]) -> None:

@@ -75,7 +75,7 @@ def median_depth(
     Raises:
         TooManyFragments: a single row of screen tiles has more fragments than memory holds.
     """
-    projection = project(*(surfels[name] for name in GEOMETRY), camera, near, alpha=alpha)
+    projection = project(*(surfels[name] for name in GEOMETRY), camera=camera, near=near, alpha=alpha)
     rows = []
     for fragments in fitting_lists(projection):
         order = fragments.pixel.argsort(stable=True)  # keeps the front-to-back order within each pixel

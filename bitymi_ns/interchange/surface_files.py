@@ -6,6 +6,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 from torch import Tensor
+from trimesh.exchange.ply import export_ply
 
 from bitymi_ns.interchange.glb import surface_glb, upright
 from bitymi_ns.interchange.triangles import Triangles
@@ -29,7 +30,7 @@ def mesh_bytes(mesh: Triangles, form: MeshFormat, up: Tensor, origin: Tensor, no
         return _obj(mesh, normals, note)
     colors = np.rint(mesh.colors * 255).astype(np.uint8)
     shape = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, vertex_colors=colors, process=False)
-    data = trimesh.exchange.ply.export_ply(shape, vertex_normal=True)
+    data = export_ply(shape, vertex_normal=True)
     return data.replace(b"\nelement", f"\ncomment {note}\nelement".encode("ascii"), 1) if note else data
 
 

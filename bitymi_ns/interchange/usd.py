@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -76,6 +77,6 @@ def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None
     stage.Save()
 
 
-def _vectors(kind: type, values: Tensor) -> object:
+def _vectors(kind: Any, values: Tensor) -> object:
     """Convert float32 rows to a USD array."""
-    return kind.FromNumpy(np.ascontiguousarray(values.numpy()))  # type: ignore[attr-defined]
+    return kind.FromNumpy(np.ascontiguousarray(values.numpy()))

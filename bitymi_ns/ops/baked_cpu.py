@@ -60,7 +60,7 @@ def frame(
     atlas, tiles, p = scene.atlas, scene.tiles, scene.surfels
     if atlas is None and scene.blocks is not None:
         raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
-    projection = project(*(p[name] for name in GEOMETRY), camera, scene.near, photo_pixel)
+    projection = project(*(p[name] for name in GEOMETRY), camera=camera, near=scene.near, photo_pixel=photo_pixel)
     geom = projection.geom
     texture = residual(scene)
     if atlas is not None and atlas.dtype == torch.uint8:
@@ -101,7 +101,7 @@ def draw(
         maps = any(name not in ("rgb", "alpha") for name in images)
         image, overdraw = frame(scene, camera, maps, photo_pixel)
         for name, views in drawn.items():
-            found = overdraw if name == "overdraw" else image[..., CHANNELS[name]]
+            found = overdraw if name == "overdraw" and overdraw is not None else image[..., CHANNELS[name]]
             if name == "rgb" and background is not None:
                 found = found + (1 - image[..., CHANNELS["alpha"]]) * background
             views.append(found)

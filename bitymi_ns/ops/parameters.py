@@ -2,12 +2,24 @@
 view colours, from `view_kinds.VIEW_COLORS`."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any, Protocol
+
+from torch import Tensor
 
 Limit = tuple[float, ...]
 """Largest absolute value of a parameter: one number, or one for each entry of its last axis."""
 SHAPE_LIMIT = 1e4  # of logits, angles and log sharpnesses: sigmoid and exp saturate far below
 SMALLEST_SHARE = 1.0 / 1024  # margin of stored sigmoids to 1, and of betas to 0, where the logit is infinite
+
+
+class Tensors(Protocol):
+    """Tensors by name: a `Mapping` or an `nn.ParameterDict`."""
+
+    def __getitem__(self, name: str, /) -> Tensor: ...
+    def __contains__(self, name: Any, /) -> bool: ...
+    def items(self) -> Iterable[tuple[str, Tensor]]: ...
 
 
 @dataclass(frozen=True)

@@ -16,23 +16,39 @@ from .parameters import GEOMETRY, GEOMETRY_PARAMETERS
 from .texel import TexelAlpha
 
 
-class CameraLike(Protocol):
-    """A pinhole camera (`scene.camera.Camera`).
+class Pinhole(Protocol):
+    """A pinhole camera.
 
     Attributes:
         viewmat: [4, 4] world to camera, OpenCV axes.
         K: [3, 3] intrinsics in pixels.
         width, height: of the image in pixels.
-        skewed: whether K[0, 1] is not 0, which the kernels do not support.
     """
 
-    viewmat: Tensor
-    K: Tensor
-    width: int
-    height: int
-
     @property
+    def viewmat(self) -> Tensor: ...
+    @property
+    def K(self) -> Tensor: ...
+    @property
+    def width(self) -> int: ...
+    @property
+    def height(self) -> int: ...
+
+
+class CameraLike(Pinhole, Protocol):
+    """`scene.camera.Camera`, as far as it is used here.
+
+    Attributes:
+        skewed: whether K[0, 1] is not 0, which the kernels do not support.
+        exact_center: [3] float64 camera centre, world.
+    """
+
+    @cached_property
     def skewed(self) -> bool: ...
+    @cached_property
+    def exact_center(self) -> Tensor: ...
+    def rows(self, top: int, bottom: int) -> CameraLike: ...
+    def local(self, points: Tensor) -> Tensor: ...
 
 
 @dataclass
@@ -72,7 +88,7 @@ class Projection:
         """Store the gradients of the projected centres; those of bands are added up in the whole view."""
         if self.whole is None:
             self.mean2d_grad, self.mean2d_absgrad = grad, absgrad
-        elif self.whole.mean2d_grad is None:
+        elif self.whole.mean2d_grad is None or self.whole.mean2d_absgrad is None:
             self.whole.mean2d_grad, self.whole.mean2d_absgrad = grad.clone(), absgrad
         else:
             self.whole.mean2d_grad += grad

@@ -4,8 +4,7 @@ The results are those of `project`, `view_color`, `rasterize_image`, `train.view
 `train.losses.objective`. Called one by one, these take the host several times as long as the GPU.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 import torch
@@ -15,7 +14,7 @@ from .backend import dense, kernel, kernel_class, module, on_device, stream_of, 
 from .bin_cuda import check_pair_count
 from .blend import checked_texels
 from .constants import FRAME, GEOM
-from .parameters import GEOMETRY
+from .parameters import GEOMETRY, Tensors
 from .picture_cuda import PhotographTarget
 from .project import CameraLike, Projection, checked_geometry, rigid_gradient
 from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
@@ -54,7 +53,7 @@ class _Drawing:
     bound: float
     moves: bool
     descent: TexelDescent | None
-    projection: Projection | None = None
+    projection: Projection = field(init=False)
 
 
 class _TrainingView(torch.autograd.Function):
@@ -146,7 +145,7 @@ class _TrainingView(torch.autograd.Function):
 
 def training_view(
     kind: str,
-    surfels: Mapping[str, Tensor],
+    surfels: Tensors,
     camera: CameraLike,
     photograph: PhotographTarget,
     correction: Tensor | None = None,
@@ -194,4 +193,4 @@ def training_view(
     losses = _TrainingView.apply(
         drawing, camera.viewmat, camera.exact_center, correction, texels, values, *surfel_inputs
     )
-    return ComparedView(*losses, drawing.projection)
+    return ComparedView(*losses, projection=drawing.projection)

@@ -1,12 +1,13 @@
 """View-dependent surfel colour f_view(d), of the kinds in `view_kinds`."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from .backend import check_shapes, dense, kernel, on_same_device
 from .constants import COLOR_BIAS, MAX_TERMS
+from .parameters import Tensors
 from .view_kinds import entry_of
 
 LEAN = ("view_base", "view_span", "view_terms")
@@ -57,7 +58,7 @@ class _ViewColor(torch.autograd.Function):
         return None, None, None, dcenter, dmeans, *grads
 
 
-def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
+def check_view_color(kind: str, params: Tensors, n: int) -> int:
     """Check the view colours of n surfels; returns the number of terms (sites, coefficients with dc, or lobes). Raises
     ValueError: unknown kind, or a parameter has the wrong shape."""
     entry = entry_of(kind)
@@ -70,7 +71,7 @@ def check_view_color(kind: str, params: Mapping[str, Tensor], n: int) -> int:
     return terms
 
 
-def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
+def check_lean(kind: str, params: Tensors, n: int) -> None:
     """Check the lean view colours of n surfels; synchronises with a CUDA device. Raises ValueError: wrong shape or
     dtype, a span outside the terms, or harmonics that end within a degree."""
     entry = entry_of(kind)
@@ -88,9 +89,7 @@ def check_lean(kind: str, params: Mapping[str, Tensor], n: int) -> None:
         raise ValueError(f"view_span of surfel {int(bad.nonzero()[0])} does not fit the {len(terms)} terms")
 
 
-def view_color(
-    kind: str, params: Mapping[str, Tensor], means: Tensor, center: Tensor, active: Tensor | None = None
-) -> Tensor:
+def view_color(kind: str, params: Tensors, means: Tensor, center: Tensor, active: Tensor | None = None) -> Tensor:
     """Compute f_view(d) without the offset 0.5, d = (mean - centre) / |mean - centre| in the world frame.
 
     Args:

@@ -2,17 +2,17 @@
 (csrc/core/view_kinds.h, and in float64 `ops.reference.view_color`)."""
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
 from .constants import LOG_TAU_MAX, MAX_TERMS, SH_C0
-from .parameters import GEOMETRY_PARAMETERS, SHAPE_LIMIT, Limit, Parameter
+from .parameters import GEOMETRY_PARAMETERS, SHAPE_LIMIT, Limit, Parameter, Tensors
 
 COLOR_LIMIT = 256.0  # of colours and of coefficients and lobes' colours, 1 = white
 DIRECTION_LIMIT = 1e6  # of unnormalised directions
@@ -62,11 +62,11 @@ class ViewColor:
         """Terms in the first parameter: 1 for sh, whose dc is the coefficient of degree 0."""
         return 0 if -1 in self.parameters[0].shape else self.base_terms
 
-    def of(self, params: Mapping[str, Tensor]) -> list[Tensor]:
+    def of(self, params: Tensors) -> list[Tensor]:
         """Select the parameters from all of the surfels'."""
         return [params[name] for name in self.names]
 
-    def terms(self, params: Mapping[str, Tensor]) -> int:
+    def terms(self, params: Tensors) -> int:
         """Count the terms."""
         return params[self.names[1]].shape[1] + self._in_first
 
@@ -223,7 +223,7 @@ PARAMETERS: dict[str, Parameter] = {
     **{p.name: p for kind in VIEW_COLORS.values() for p in kind.parameters},
 }
 """All parameters of a surfel, with the view colours of all kinds, by name."""
-Kind = Literal[tuple(VIEW_COLORS)]  # type: ignore[valid-type]
+Kind = Literal["sv", "sh", "sb", "sg"]
 """Names of `VIEW_COLORS`, for options and files checked by type."""
 
 
@@ -234,12 +234,12 @@ def entry_of(kind: str) -> ViewColor:
     return VIEW_COLORS[kind]
 
 
-def kind_of(params: Mapping[str, Tensor]) -> str:
+def kind_of(params: Tensors) -> Kind:
     """Return the kind whose parameters are complete. Raises ValueError: no kind is."""
-    for kind, entry in VIEW_COLORS.items():
-        if all(name in params for name in entry.names):
+    for kind in get_args(Kind):
+        if all(name in params for name in VIEW_COLORS[kind].names):
             return kind
-    raise ValueError(f"no view colour among the surfels' parameters {sorted(params)}")
+    raise ValueError(f"no view colour among the surfels' parameters {sorted(name for name, _ in params.items())}")
 
 
 def fibonacci_sphere(n: int) -> Tensor:

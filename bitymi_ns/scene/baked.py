@@ -149,7 +149,7 @@ class BakedScene:
             ValueError: the scene is on the CPU and has only the atlas's BC7 blocks.
         """
         images = {name: image[0] for name, image in self._draw([camera], background, image_names(maps)).items()}
-        return BakedOutput(*map(images.get, OUTPUTS))
+        return BakedOutput(images["rgb"], images["alpha"], *map(images.get, OUTPUTS[2:]))
 
     @torch.no_grad()
     def render_views(

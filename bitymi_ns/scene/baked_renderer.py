@@ -95,10 +95,10 @@ class BakedRenderer:
                 self._draw(stages)
                 return
             if self._graph is None:
-                self._record()
+                self._graph = self._record()
             self._graph.replay()
 
-    def _record(self) -> None:
+    def _record(self) -> torch.cuda.CUDAGraph:
         self._draw(Stage.ALL)  # the first call loads kernels, which cannot be recorded
         torch.cuda.synchronize(self._viewmats.device)
         graph = torch.cuda.CUDAGraph()
@@ -111,7 +111,7 @@ class BakedRenderer:
         finally:
             if collects:
                 gc.enable()
-        self._graph = graph
+        return graph
 
     def complete(self) -> bool:
         """Wait for the latest frame; return True if the working memory was large enough for it."""
@@ -163,4 +163,5 @@ class SceneRenderer:
                 names, graph = image_names(maps), device.type == "cuda"
                 self._renderers[key] = BakedRenderer(scene, *key[:2], 1, names, background, graph)
             images = self._renderers[key].draw([camera], background=background)
-            return BakedOutput(**{name: images[name][0].clone() if name in images else None for name in OUTPUTS})
+            copies = {name: image[0].clone() for name, image in images.items()}
+            return BakedOutput(copies["rgb"], copies["alpha"], *map(copies.get, OUTPUTS[2:]))

@@ -17,6 +17,12 @@ def _tensor(numbers: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
 
 
+def vector(numbers: Sequence[float]) -> Vector:
+    """Make a vector of three numbers."""
+    x, y, z = numbers
+    return x, y, z
+
+
 @dataclass(frozen=True)
 class Box:
     """Oriented box, faces included."""
@@ -33,7 +39,8 @@ class Box:
     @classmethod
     def of(cls, center: Sequence[float], half: Sequence[float], axes: Sequence[Sequence[float]]) -> Box:
         """Make a box of numbers in any sequences."""
-        return cls(tuple(center), tuple(half), tuple(map(tuple, axes)))  # type: ignore[arg-type]
+        x, y, z = map(vector, axes)
+        return cls(vector(center), vector(half), (x, y, z))
 
     def contains(self, points: Tensor) -> Tensor:
         """Tell which of the points [N, 3] lie in the box, [N] bool."""

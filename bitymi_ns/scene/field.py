@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -15,10 +15,12 @@ from bitymi_ns.ops.field import FieldGeometry, field
 
 from .config import SceneConfig
 
+T = TypeVar("T")
 
-def _is_current(cached: tuple[Tensor, int, Any] | None, buffer: Tensor) -> bool:
-    """Test if a cached value belongs to a buffer in its current version."""
-    return cached is not None and cached[0] is buffer and cached[1] == version_of(buffer)
+
+def _current(cached: tuple[Tensor, int, T] | None, buffer: Tensor) -> T | None:
+    """Return a cached value if it belongs to a buffer in its current version."""
+    return cached[2] if cached is not None and cached[0] is buffer and cached[1] == version_of(buffer) else None
 
 
 class ResidualField(nn.Module):
@@ -71,6 +73,8 @@ class HashField(ResidualField):
         log2_table_size: log2 of the entries per level.
     """
 
+    domain: Tensor
+
     def __init__(
         self,
         config: SceneConfig,
@@ -100,11 +104,12 @@ class HashField(ResidualField):
     @property
     def geometry(self) -> FieldGeometry:
         """Geometry of the grid. Cached, to avoid a synchronisation in every step."""
-        if not _is_current(self._geometry, self.domain):
-            *mid, half, contract = self.domain.tolist()
-            geometry = FieldGeometry(self.min_resolution, bool(contract), tuple(mid), half)
+        geometry = _current(self._geometry, self.domain)
+        if geometry is None:
+            x, y, z, half, contract = self.domain.tolist()
+            geometry = FieldGeometry(self.min_resolution, bool(contract), (x, y, z), half)
             self._geometry = (self.domain, version_of(self.domain), geometry)
-        return self._geometry[2]
+        return geometry
 
     @property
     def weights(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -155,6 +160,10 @@ class TexelField(ResidualField):
     STEADY: ClassVar = ("size", "extent", "share")
     """Buffers that training replaces but never modifies in place, so that copies of the scene may share them."""
 
+    size: Tensor
+    extent: Tensor
+    share: Tensor
+
     def __init__(
         self,
         size: Tensor,
@@ -182,9 +191,11 @@ class TexelField(ResidualField):
     @property
     def tiles(self) -> TexelTiles:
         """Sizes and texel offsets of the surfels' tiles."""
-        if not _is_current(self._tiles, self.size):
-            self._tiles = (self.size, version_of(self.size), TexelTiles.of_sizes(self.size, self.extent))
-        return self._tiles[2]
+        tiles = _current(self._tiles, self.size)
+        if tiles is None:
+            tiles = TexelTiles.of_sizes(self.size, self.extent)
+            self._tiles = (self.size, version_of(self.size), tiles)
+        return tiles
 
     @torch.no_grad()
     def keep(self, rows: Tensor) -> None:

@@ -182,7 +182,7 @@ class Scene(nn.Module):
         learns, bound = field_mode == "train", self.config.weight_bound
         descent = descent if learns else None
         alpha = None if self.field is None else self.field.opacity(bound, learns)
-        projection = project(*(p[name] for name in GEOMETRY), camera, self.near, alpha=alpha)
+        projection = project(*(p[name] for name in GEOMETRY), camera=camera, near=self.near, alpha=alpha)
         texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode, descent)
         base = self.base_color(projection)
         if texture is not None:

@@ -75,7 +75,7 @@ def visibility(
     largest, pixels = means.new_zeros(2, len(means))
     squares = torch.zeros(len(cameras), len(means), dtype=torch.bfloat16, device=means.device)
     for done, camera in enumerate(cameras, start=1):
-        projection = project(*geometry, camera.to(means.device), near, alpha=alpha)
+        projection = project(*geometry, camera=camera.to(means.device), near=near, alpha=alpha)
         shown = surfel_coverage(projection, weight_bound)
         largest, pixels = torch.maximum(largest, shown[:, 0]), torch.maximum(pixels, shown[:, 1])
         squares[done - 1] = shown[:, 2]

@@ -66,7 +66,7 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
         return BackgroundPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
     medians = medians.nan_to_num(float(medians.nanmedian()))
     typical_count = float(counts.median())
-    grids = [_Grid.of(camera, *each, typical_count) for camera, each in zip(cameras, seen, strict=True)]
+    grids = [_Grid.of(camera, *each, count=typical_count) for camera, each in zip(cameras, seen, strict=True)]
     found = [
         _points_behind(view, camera, grid, float(median), generator)
         for view, camera, grid, median in zip(chosen, cameras, grids, medians, strict=True)

@@ -125,7 +125,7 @@ def surfels_from_points(
     n = len(xyz)
     to_camera, camera_distance = _nearest_camera(xyz, centers)
     largest = MAX_SCALE * torch.clamp(camera_distance, min=extent)
-    if report.background:
+    if background is not None and report.background:
         largest[first:] = torch.minimum(largest[first:], background.scales[: report.background])
     scales = torch.minimum(neighbour_distance(xyz, extent), largest).clamp(min=MIN_SCALE * extent)
     logit = math.log(config.init_opacity / (1.0 - config.init_opacity))
@@ -313,11 +313,11 @@ def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple
     or the corners of the capture's box), a tenth larger.
     """
     if contract and len(camera_centers):
-        middle = camera_centers.detach().float().cpu().mean(0)
-        return tuple(middle.tolist()), scene_extent(camera_centers, means)  # type: ignore[return-value]
+        x, y, z = camera_centers.detach().float().cpu().mean(0).tolist()
+        return (x, y, z), scene_extent(camera_centers, means)
     low, high = means.amin(0), means.amax(0)
-    middle, half = (low + high) / 2, 0.55 * float((high - low).max())
-    return tuple(middle.tolist()), max(half, 1e-3)  # type: ignore[return-value]
+    x, y, z = ((low + high) / 2).tolist()
+    return (x, y, z), max(0.55 * float((high - low).max()), 1e-3)
 
 
 def default_table_size(image_pixels: int) -> int:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn import Parameter
+from torch.nn import Parameter, ParameterDict
 from torch.optim import Adam, Optimizer
 
 from bitymi_ns.exit_messages import out_of_memory
@@ -24,7 +24,7 @@ BETAS = (0.9, 0.999)  # Adam's betas of surfel parameters
 FIELD_BETAS = (0.9, 0.99)  # those of the texture field, whose gradients are sparse, and large early on
 
 
-def adam(parameters: list[Parameter], betas: tuple[float, float] = BETAS, rate: float = 0.0, eps: float = EPS) -> Adam:
+def adam(parameters: Sequence[Tensor], betas: tuple[float, float] = BETAS, rate: float = 0.0, eps: float = EPS) -> Adam:
     """Create an Adam optimiser, fused where torch can: on the CPU since 2.4."""
     return Adam(parameters, lr=rate, betas=betas, eps=eps, fused=_fuses(parameters[0].device.type))
 
@@ -193,7 +193,7 @@ ResizeHook = Callable[[str, Parameter], None]  # called with the name and the ne
 
 @torch.no_grad()
 def replace_rows(
-    surfels: MutableMapping[str, Parameter],
+    surfels: ParameterDict,
     optimizers: Mapping[str, Optimizer],
     keep: Tensor,
     new: Mapping[str, Tensor] | None = None,
@@ -235,7 +235,7 @@ def replace_rows(
 
 @torch.no_grad()
 def cap_opacity(
-    surfels: Mapping[str, Parameter], optimizers: Mapping[str, Optimizer], highest: float, forget_all: bool = False
+    surfels: ParameterDict, optimizers: Mapping[str, Optimizer], highest: float, forget_all: bool = False
 ) -> int:
     """Clamp opacities to at most `highest`, in place, and reset the optimiser state of those lowered, or of all rows.
 

@@ -24,6 +24,7 @@ from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.constants import ALPHA_MIN
+from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.ops.picture_cuda import accumulate_statistics
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
@@ -245,7 +246,7 @@ class Strategy:
         self.most = self.most_by_memory = fitting
         return {"most_by_memory": fitting}
 
-    def _halves(self, surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+    def _halves(self, surfels: Tensors, rows: Tensor) -> dict[str, Tensor]:
         """Split surfels into two halves along their long axes, which together look about like the surfel."""
         halves = {name: p.detach()[rows].repeat_interleave(2, dim=0) for name, p in surfels.items()}
         long = one_hot(halves["log_scales"].argmax(-1), 2).to(halves["log_scales"])  # [2S, 2]
@@ -259,7 +260,7 @@ class Strategy:
 
     # ---- pruning
 
-    def _prunable(self, surfels: Mapping[str, Tensor]) -> Tensor:
+    def _prunable(self, surfels: Tensors) -> Tensor:
         config = self.config.densify
         candidate = surfels["opacity_logits"].sigmoid() < config.prune_opacity
         return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)

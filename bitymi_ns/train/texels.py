@@ -62,13 +62,15 @@ class LearningTexels:
         device = self.scene.surfels["means"].device
         of_texel = PER_TEXEL + PER_TEXEL_SUM * (device.type == "cuda")
         fitting = max(0, int(room_to_grow(device, self.processes) / of_texel))
-        field, found = None, None
+        made = None
         if self.processes.first:
-            field, bound = _blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come, fitting)
-            found = {**field.state_dict(), "bound": bound}
-        if self.processes.count > 1:
-            found = self.processes.from_first(found, device)
+            made = _blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come, fitting)
+        stated = None if made is None else {**made[0].state_dict(), "bound": made[1]}
+        found = self.processes.from_first(stated, device)
+        if made is None:
             field = TexelField(found["size"], found["extent"], found["texels"], found["share"], found.get("alpha"))
+        else:
+            field = made[0]
         self.scene.field = field
         self.most_by_memory = len(field.texels) if found["bound"] else 0
         return True
@@ -112,12 +114,12 @@ class LearningTexels:
     def average(self) -> None:
         """Average the gradients over all views of the step; processes exchange only rows with a nonzero gradient."""
         parameters = self._parameters
+        gradients = []
         for values in parameters:
-            if values.grad is None:
-                values.grad = torch.zeros_like(values)
-        gradients = [values.grad.view(len(values), -1) for values in parameters]
+            values.grad = torch.zeros_like(values) if values.grad is None else values.grad
+            gradients.append(values.grad.view(len(values), -1))
         if self.processes.count > 1 and parameters:
-            moved = sum(gradient.any(1).to(torch.uint8) for gradient in gradients)
+            moved = torch.stack([gradient.any(1) for gradient in gradients]).any(0).to(torch.uint8)
             self.processes.maximum(moved)
             rows = moved.nonzero().flatten()
             sums = [gradient.index_select(0, rows) for gradient in gradients]
@@ -132,7 +134,7 @@ class LearningTexels:
         """Update colours and alphas by their averaged gradients."""
         field = self.scene.field
         for values in self._parameters:
-            if values.grad is not None:
+            if values.grad is not None and isinstance(field, TexelField):
                 share = field.share if values is field.alpha else field.share[:, None]
                 values.addcmul_(share, values.grad, value=-1.0)
                 values.grad = None
@@ -264,6 +266,6 @@ def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     for view in views:
         geometry = (scene.surfels[name].detach() for name in GEOMETRY)
         camera = view.camera.to(covered.device)
-        projection = project(*geometry, camera, scene.near)
+        projection = project(*geometry, camera=camera, near=scene.near)
         add_texel_coverage(projection, field.tiles, view.mask, scene.config.weight_bound, covered)
     return covered[:, 0]

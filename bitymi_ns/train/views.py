@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -333,7 +333,7 @@ class MemoryBudget:
         return True
 
 
-class OnDemand(Sequence, Generic[T]):
+class OnDemand(Sequence[T]):
     """A sequence that creates its items at each access.
 
     Args:
@@ -346,5 +346,5 @@ class OnDemand(Sequence, Generic[T]):
     def __len__(self) -> int:
         return len(self._indices)
 
-    def __getitem__(self, index: int) -> T:  # type: ignore[override]
+    def __getitem__(self, index: int) -> T:
         return self._make(self._indices[index])

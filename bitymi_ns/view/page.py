@@ -105,7 +105,8 @@ def media_type(path: str) -> str:
 def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
     """Return readers of the built page's files, by name. Raises PageError: the page was not built."""
     folder = Path(str(resources.files("bitymi_ns.view"))) / "page"
-    files = {path.name: path.read_bytes for path in sorted(folder.glob("*")) if path.is_file()}
+    found = [path for path in sorted(folder.glob("*")) if path.is_file()]
+    files: dict[str, Callable[[], bytes | bytearray]] = {path.name: path.read_bytes for path in found}
     if "index.html" not in files:
         raise PageError(f"the viewer's page is missing from {folder}: in a checkout, build it with `make web`")
     return files

@@ -42,7 +42,7 @@ class _Timed(io.RawIOBase):
     def readable(self) -> bool:
         return True
 
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+    def readinto(self, buffer: memoryview) -> int:
         left = self.until - time.monotonic()
         if left <= 0:
             raise TimeoutError

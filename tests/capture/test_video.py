@@ -197,6 +197,16 @@ def test_what_is_no_video_is_refused(tmp_path: Path) -> None:
         extract_frames(tmp_path / "a.mp4", tmp_path, None, silent)
 
 
+def test_an_error_of_the_decoder_without_a_reason_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("a value of the file is out of range")
+
+    (tmp_path / "film.mp4").write_bytes(b"\0" * 64)
+    monkeypatch.setattr(av, "open", refuse)
+    with pytest.raises(CaptureError, match="out of range"):
+        extract_frames(tmp_path / "film.mp4", tmp_path, None, silent)
+
+
 @pytest.mark.parametrize(
     ("name", "share", "line"),
     [

@@ -1,6 +1,6 @@
 """Entries of `VIEW_COLORS` are consistent with themselves, the kernels and the float64 twin."""
 
-from typing import get_type_hints
+from typing import get_args, get_type_hints
 
 import pytest
 import torch
@@ -9,10 +9,14 @@ import yaml
 from bitymi_ns import ops
 from bitymi_ns.ops.reference import view_color as reference
 from bitymi_ns.ops.view_color import check_lean, check_view_color
-from bitymi_ns.ops.view_kinds import VIEW_COLORS, kind_of
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, Kind, kind_of
 from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import LearningRates
+
+
+def test_the_type_of_options_has_the_kinds() -> None:
+    assert get_args(Kind) == tuple(VIEW_COLORS)
 
 
 @pytest.mark.parametrize("kind", list(VIEW_COLORS))

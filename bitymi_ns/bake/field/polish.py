@@ -13,6 +13,7 @@ from bitymi_ns.bake.stages import Trained
 from bitymi_ns.bake.tune import TuneOptions
 from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import FineTuning
+from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import Positive, PositiveCount
 from bitymi_ns.scene.config import SceneConfig
@@ -53,7 +54,7 @@ def _polish_run(
     share = 1.0 / (texels.coverage(views, progress)[:, 0] + options.prior)
     config = SceneConfig(
         texture="texels",
-        view_color=drawn.view_color,  # type: ignore[arg-type]
+        view_color=kind_of(drawn.surfels),
         weight_bound=drawn.weight_bound,
     )
     scene = Scene(config, drawn.surfels, TexelField(tiles.size, tiles.extent, texels.values, share), near=drawn.near)
@@ -131,7 +132,7 @@ def polish_scene(
     statistics = stopping.statistics(len(trained), len(validation), *spent).replace(
         psnr_held_out=gain(before, _psnr(run, background, eval_views)) if eval_views else None
     )
-    result = baked.with_colors(run.scene.field.texels).with_surfels(dict(run.scene.surfels))
+    result = baked.with_colors(stopping.best["field.texels"]).with_surfels(dict(run.scene.surfels))
     return result.stating(polish=statistics)
 
 

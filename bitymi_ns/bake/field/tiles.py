@@ -37,9 +37,11 @@ class Field(Protocol):
 
     def __call__(self, x: Tensor) -> Tensor:
         """Map world positions [M, 3] to residual colours [M, 3]."""
+        ...
 
     def voxel_size(self, x: Tensor) -> Tensor:
         """Map world positions [M, 3] to finest voxel edges [M, 2] (radial, tangential), world units."""
+        ...
 
 
 @torch.no_grad()

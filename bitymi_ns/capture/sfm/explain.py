@@ -147,7 +147,9 @@ def _rays(group: CameraGroup, points: np.ndarray, guess: float) -> tuple[np.ndar
     camera, side = group.camera.colmap, max(group.camera.size)
     if not (group.prior or camera.is_spherical()):
         camera = pycolmap.Camera.create_from_model_name(0, "SIMPLE_PINHOLE", guess * side, *group.camera.size)
-    return camera.cam_ray_from_img(points.astype(np.float64)), _pixels_per_radian(camera)
+    rays = camera.cam_ray_from_img(points.astype(np.float64))
+    assert rays is not None  # as for a single point without one
+    return rays, _pixels_per_radian(camera)
 
 
 def _pixels_per_radian(camera: pycolmap.Camera) -> float:

@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from bitymi_ns.capture.sfm.job import DATABASE, PAIRS, Job
 from bitymi_ns.capture.types import CaptureError
@@ -21,7 +22,7 @@ LOG = "colmap.log"
 LITTLE_SPACE = 50_000_000  # free bytes below which a failure counts as a full disk
 
 
-def run(job: Job, source: Path, progress: Progress) -> dict[str, object]:
+def run(job: Job, source: Path, progress: Progress) -> dict[str, Any]:
     """Run a job, and return the worker's result. Raises CaptureError: there are no poses, or COLMAP failed."""
     work = Path(job.work)
     watching = ExitStack()

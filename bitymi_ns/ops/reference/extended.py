@@ -6,15 +6,16 @@ imaginary part of the result over that of the input is exact to rounding.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.ops.project import CameraLike
+from bitymi_ns.ops.project import Pinhole
 from bitymi_ns.ops.reference.project import BETA_MAX, LOG_SCALE_MAX
 from bitymi_ns.ops.reference.trace import ALPHA_MAX, ALPHA_MIN, SUPPORT, TRANSMITTANCE_MIN
 
-Array = npt.NDArray[np.clongdouble]
+Array = npt.NDArray[Any]  # clongdouble
 
 
 @dataclass
@@ -30,7 +31,7 @@ class Extended:
     low_pass: npt.NDArray[np.bool_]  # [P, N]
 
 
-def render(geometry: Sequence[npt.ArrayLike], camera: CameraLike, near: float = 0.2) -> Extended:
+def render(geometry: Sequence[npt.ArrayLike], camera: Pinhole, near: float = 0.2) -> Extended:
     """Render every pixel against every surfel; arguments as `reference.render`, real or complex, without colours."""
     mean, q, logs, logit, raw, view, k = (
         np.asarray(a, dtype=np.clongdouble) for a in (*geometry, camera.viewmat, camera.K)
@@ -80,7 +81,7 @@ def render(geometry: Sequence[npt.ArrayLike], camera: CameraLike, near: float = 
     beta = BETA_MAX / (1 + np.exp(-raw))
     kernel = np.where(inside, np.exp(beta * np.log(np.where(inside, rest, 1))), 0)
     front = np.where(valid, p[:, 2], 1)
-    center = np.stack([k[0, 0] * p[:, 0] / front + k[0, 2], k[1, 1] * p[:, 1] / front + k[1, 2]], -1)
+    center = np.stack([k[0, 0] * p[:, 0] / front + k[0, 2], k[1, 1] * p[:, 1] / front + k[1, 2]], -1).astype(k.dtype)
     dx, dy = px[:, None] + np.longdouble(0.5) - center[:, 0], py[:, None] + np.longdouble(0.5) - center[:, 1]
     blur = np.exp(-(dx * dx + dy * dy))
     low_pass = blur.real > kernel.real

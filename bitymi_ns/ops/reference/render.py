@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.project import CameraLike
+from bitymi_ns.ops.project import Pinhole
 from bitymi_ns.ops.reference.project import project
 from bitymi_ns.ops.reference.trace import SUPPORT, Trace, trace
 
@@ -67,7 +67,7 @@ def fetched(tiles: Sequence[Tensor], uv: Tensor, where: Tensor) -> Tensor:
 def render(
     geometry: Sequence[Tensor],
     colors: Tensor,
-    camera: CameraLike,
+    camera: Pinhole,
     background: Tensor | None = None,
     tiles: Sequence[Tensor] | None = None,
     residual: Callable[[Tensor], Tensor] | None = None,
@@ -87,13 +87,14 @@ def render(
         rim: see `trace`.
     """
     width, height = camera.width, camera.height
-    p = project(*geometry, camera.viewmat, camera.K, near)
-    alphas = tiles is not None and any(tile.shape[-1] == 4 for tile in tiles)
+    p = project(*geometry, viewmat=camera.viewmat, K=camera.K, near=near)
+    tiles = tiles or ()
+    alphas = any(tile.shape[-1] == 4 for tile in tiles)
     factor = (lambda uv, where: fetched(tiles, uv, where)[..., 3]) if alphas else None
     t = trace(p, width, height, near, rim, factor=factor)
     base = torch.relu(colors + 0.5)  # [N, 3]
     color = base.expand(width * height, -1, -1)  # [P, N, 3]
-    if tiles is not None:
+    if tiles:
         color = torch.relu(color + fetched(tiles, t.uv, t.blended)[..., :3])
     if residual is not None:
         pixel, surfel = t.blended.nonzero(as_tuple=True)

@@ -65,7 +65,7 @@ def sh(dc: Tensor, rest: Tensor, dirs: Tensor, degree: int | None = None) -> Ten
     """Evaluate spherical harmonics from dc [N, 3] and rest [N, >= (degree + 1)^2 - 1, 3] at unit dirs [N, 3]: [N, 3].
     Without `degree`, all coefficients are used."""
     if degree is None:
-        degree = round((rest.shape[1] + 1) ** 0.5) - 1
+        degree = math.isqrt(rest.shape[1] + 1) - 1
     coefficients = torch.cat([dc[:, None], rest[:, : (degree + 1) ** 2 - 1]], dim=1)
     return (sh_basis(degree, dirs)[..., None] * coefficients).sum(1)
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.ops.project import geometry_of
 
 CPU = torch.device("cpu")
 WARM_UP = 2
@@ -34,7 +35,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, dict[str, Callable[[], 
     baked, _ = textured(n, width, height, CPU)
     q, field, bound = scene.surfels, scene.field, scene.config.weight_bound
     assert field is not None
-    geometry = (q["means"], q["quats"], q["log_scales"], q["opacity_logits"], q["beta_raw"])
+    geometry = geometry_of(q)
     project = partial(ops.project, *geometry, camera, scene.near)
     projection = project()
     fragments = ops.trace(projection, scene.config.rim)

@@ -36,6 +36,7 @@ from bitymi_ns.ops import (
 from bitymi_ns.ops.backend import on_same_device
 from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.constants import BETA_MAX, COLOR_BIAS
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
 from bitymi_ns.train.config import RefinePoses
@@ -145,8 +146,9 @@ def rasterize(
         opacities=(opacities, 0.0, 1.0),
         betas=(betas, 0.0, BETA_MAX),
     )
-    geometry = (means, quats, scales.log(), _logit(opacities), _logit(betas / BETA_MAX))
-    projection = project(*geometry, camera, near)
+    surfels = {"means": means, "quats": quats, "log_scales": scales.log()}
+    surfels |= {"opacity_logits": _logit(opacities), "beta_raw": _logit(betas / BETA_MAX)}
+    projection = project(*geometry_of(surfels), camera, near)
     base = colors - COLOR_BIAS
     if not maps and can_rasterize(means.device):
         image, marks = rasterize_image(projection, base)

@@ -17,7 +17,7 @@ from bitymi_ns.codec import limits, packing, surfel_codes, texel_codes
 from bitymi_ns.codec.limits import LIMITS, limit_of
 from bitymi_ns.ops import constants, view_kinds
 from bitymi_ns.ops.constants import MAX_TERMS, SUPPORT
-from bitymi_ns.ops.parameters import GEOMETRY, Limit
+from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS, Limit
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.ops.webgpu import on_device
 from bitymi_ns.ops.webgpu.arrays import FIELDS, FRAME, KINDS, SEEN, SURFEL, WHOLE
@@ -38,7 +38,8 @@ PARTS = {
 TYPES = {
     "EARLIER": "Record<string, string>",
     "LEAN_COUNTS": "Record<string, readonly number[] | null>",
-    "LINEAR": "Record<string, { at: number; limit: number; least: number | null }>",
+    "LINEAR": "Record<string, { words: readonly number[]; limit: number } & Record<'least' | 'absent', number | null>>",
+    "PLY": "Record<string, readonly [number, number | null]>",
     "RANGES": "Record<string, readonly [number, number]>",
     "STEPPED": "readonly string[]",
 }
@@ -139,11 +140,20 @@ def tables() -> str:
         "SEEN_BYTES": SEEN.itemsize,
         "FRAME_BYTES": FRAME.itemsize,
         "FRAME": words_of(FRAME),
-        "PLY": {column: at_word(name)[0] + i for name in GEOMETRY for i, column in enumerate(COLUMNS[name])},
+        "PLY": {
+            column: [at_word(name)[0] + i, parameter.absent]
+            for name, parameter in GEOMETRY_PARAMETERS.items()
+            for i, column in enumerate(COLUMNS[name])
+        },
         "COLUMNS": {k: n for k, n in surfel_codes.columns_of("sv", True).items() if not k.startswith("term_")},
         "STEPPED": [*surfel_codes.REFERENCE, "residual"],
         "LINEAR": {
-            column: {"at": at_word(p.name)[0], "limit": p.limit[0], "least": p.least}
+            column: {
+                "words": [at_word(p.name)[0] + i for i in range(p.width)],
+                "limit": p.limit[0],
+                "least": p.least,
+                "absent": p.absent,
+            }
             for column, p in surfel_codes.LINEAR.items()
         },
         "KINDS": KINDS,

@@ -20,7 +20,7 @@ from bitymi_ns.ops import (
     select,
     view_color,
 )
-from bitymi_ns.ops.parameters import GEOMETRY
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import count_values, photometric
@@ -49,7 +49,7 @@ class TexelList:
 
     def projection(self, camera: Camera) -> Projection:
         """Project the surfels into a view."""
-        geometry = (self.scene.surfels[name] for name in GEOMETRY)
+        geometry = geometry_of(self.scene.surfels)
         return project(*geometry, camera=camera.to(self.device), near=self.scene.near, alpha=self.alpha)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress) -> Tensor:

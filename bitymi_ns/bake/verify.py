@@ -9,6 +9,7 @@ from bitymi_ns.bake.view_colors import centers_of, view_color_errors
 from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.verify import SLACK_STEPS, Check, steps_text
 from bitymi_ns.codec.pages import texel_alpha
+from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.scene.visibility import visibility
@@ -55,5 +56,5 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
 
 def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:
     """Select the numbers per surfel that a bundle holds bit for bit."""
-    parts = [surfels["means"], surfels["log_scales"], surfels["opacity_logits"][:, None], surfels["beta_raw"][:, None]]
+    parts = [surfels[name][..., None].flatten(1) for name in GEOMETRY if name != "quats"]
     return [row.tobytes() for row in torch.cat(parts, dim=1).numpy()]

@@ -58,7 +58,7 @@ def decode_surfels(
     """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] if it has them. Raises
     StreamError: the file is damaged, contradicts bundle.json, or holds a number out of range."""
     assert info.columns is not None and info.frame is not None
-    numbers = columns_of(info.view_color, has_alpha)
+    numbers = columns_of(info.view_color, has_alpha, [column.name for column in info.columns])
     steps = _check_columns(info.columns, numbers, (*REFERENCE, "residual"))
     rows = dict.fromkeys(numbers, info.count) | dict.fromkeys(("term_shape", "term_color"), info.terms or 0)
     codes: dict[str, Codes] = {}

@@ -168,6 +168,8 @@ def from_columns(
     count = len(tiles)
     surfels = {
         name: _stack(columns, COLUMNS[name]).reshape(count, *parameter.shape)
+        if parameter.absent is None or COLUMNS[name][0] in columns
+        else torch.full((count, *parameter.shape), parameter.absent, dtype=torch.float32)
         for name, parameter in GEOMETRY_PARAMETERS.items()
     }
     if terms is not None:

@@ -1,6 +1,6 @@
 """Integer codes of surfels and their decoding."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +34,14 @@ CODED = {parameter.code: name for name, parameter in GEOMETRY_PARAMETERS.items()
 """Surfel parameter of each column whose name differs."""
 
 
-def columns_of(kind: str, has_alpha: bool) -> dict[str, int]:
-    """Count the numbers per row of the columns of surfels.bin, in their order."""
+def columns_of(kind: str, has_alpha: bool, stated: Collection[str] | None = None) -> dict[str, int]:
+    """Count the numbers per row of the columns of surfels.bin, in their order. `stated`: columns of a file, which may
+    lack what earlier versions do (`Parameter.absent`)."""
     colors, shapes = term_numbers(kind)
     numbers = {"place": 1, "largest": 1, "rotation": 3, **{column: p.width for column, p in LINEAR.items()}, "size": 1}
+    if stated is not None:
+        lacking = {column for column, p in LINEAR.items() if p.absent is not None}.difference(stated)
+        numbers = {column: count for column, count in numbers.items() if column not in lacking}
     numbers |= {"residual": 3, **({"alpha": 1} if has_alpha else {}), "view_base": 3, "extent": 1, "view_count": 1}
     return numbers | {"term_shape": len(shapes), "term_color": len(colors)}
 
@@ -113,6 +117,8 @@ class SurfelCodes:
         return self.steps[name] * self.codes[name]
 
     def _values(self, column: str, parameter: Parameter) -> npt.NDArray[np.float64]:
+        if column not in self.codes:
+            return np.full((len(self), *parameter.shape), parameter.absent)
         values = self._linear(column).reshape(-1, *parameter.shape)
         return values if parameter.least is None else _logit(values, parameter.least)
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
 from bitymi_ns.ops import TexelAlpha, fitting_lists, project
-from bitymi_ns.ops.parameters import GEOMETRY
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
@@ -75,7 +75,7 @@ def median_depth(
     Raises:
         TooManyFragments: a single row of screen tiles has more fragments than memory holds.
     """
-    projection = project(*(surfels[name] for name in GEOMETRY), camera=camera, near=near, alpha=alpha)
+    projection = project(*geometry_of(surfels), camera=camera, near=near, alpha=alpha)
     rows = []
     for fragments in fitting_lists(projection):
         order = fragments.pixel.argsort(stable=True)  # keeps the front-to-back order within each pixel

@@ -9,8 +9,7 @@ from torch import Tensor
 from .backend import kernel, lookup
 from .baked_scene import BakedSceneLike, check_images, common_size, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
-from .parameters import GEOMETRY
-from .project import CameraLike, project
+from .project import CameraLike, geometry_of, project
 from .trace_cpu import tile_lists
 from .view_color import view_color
 
@@ -60,7 +59,7 @@ def frame(
     atlas, tiles, p = scene.atlas, scene.tiles, scene.surfels
     if atlas is None and scene.blocks is not None:
         raise ValueError("the CPU needs decoded texels: read the bundle with decode=True")
-    projection = project(*(p[name] for name in GEOMETRY), camera=camera, near=scene.near, photo_pixel=photo_pixel)
+    projection = project(*geometry_of(p), camera=camera, near=scene.near, photo_pixel=photo_pixel)
     geom = projection.geom
     texture = residual(scene)
     if atlas is not None and atlas.dtype == torch.uint8:

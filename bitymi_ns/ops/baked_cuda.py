@@ -15,7 +15,7 @@ from .backend import function, lookup, module, on_device
 from .baked_scene import IMAGES, LEVELS, BakedSceneLike, check_images, common_size, decode_bc7, residual
 from .constants import TILE
 from .parameters import GEOMETRY
-from .project import CameraLike
+from .project import CameraLike, geometry_of
 from .view_color import LEAN, check_lean, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
 
@@ -172,7 +172,7 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
             atlas |= {name: level.texture for name, level in levels.items()}
     with on_device(device):
         return lookup("BakedScene", device)(
-            **{name: p[name] for name in GEOMETRY},
+            **dict(zip(GEOMETRY, geometry_of(p), strict=True)),
             **colors,
             **residual(scene),
             **atlas,

@@ -34,10 +34,10 @@ class Parameter:
     activation: str | None = None  # activation of a view colour as stated in bundle.json; None: not stated
     columns: tuple[str, ...] | None = None  # columns of surfels.ply; None: <name>_<i>
     code: str | None = None  # column of surfels.bin; None: its name
-    step: float | None = (
-        None  # reference step of that column, whose codes are linear; None: `codec.surfel_codes` has it
-    )
-    least: float | None = None  # the codes are of sigmoids, from this to 1 - `SMALLEST_SHARE`; None: of the values
+    step: float | None = None  # reference step of that column, coded number by number; None: not coded so
+    start: float | None = None  # value of a new surfel; None: `train.init` has it
+    absent: float | None = None  # its value in bundles that lack it, as of earlier versions; None: all have it
+    least: float | None = None  # coded as sigmoids, from this to 1 - `SMALLEST_SHARE`; None: coded as they are
 
     @property
     def width(self) -> int:
@@ -63,6 +63,7 @@ GEOMETRY_PARAMETERS: dict[str, Parameter] = {
         ),
         Parameter(
             *("beta_raw", (), (SHAPE_LIMIT,), "beta_raw"),
+            start=2.0,  # a nearly Gaussian kernel: beta = 4 sigmoid(2) = 3.52
             columns=("beta",),
             code="beta",
             step=1.0 / 32,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -191,6 +191,16 @@ def refuse_skew(camera: CameraLike) -> None:
     """Raise ValueError for a camera whose K[0, 1] is not 0."""
     if camera.skewed:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
+
+
+def geometry_of(surfels: Mapping[str, Tensor]) -> list[Tensor]:
+    """List the surfels' parameters of `GEOMETRY`; one that is missing has the value `Parameter.absent`. Raises
+    KeyError: it has none."""
+    means = surfels["means"]
+    for name, parameter in GEOMETRY_PARAMETERS.items():
+        if name not in surfels and parameter.absent is not None:
+            surfels = {**surfels, name: means.new_full((len(means), *parameter.shape), parameter.absent)}
+    return [surfels[name] for name in GEOMETRY]
 
 
 def checked_geometry(geometry: Sequence[Tensor], camera: CameraLike) -> Sequence[Tensor]:

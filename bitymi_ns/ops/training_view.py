@@ -16,7 +16,7 @@ from .blend import checked_texels
 from .constants import FRAME, GEOM
 from .parameters import GEOMETRY, Tensors
 from .picture_cuda import PhotographTarget
-from .project import CameraLike, Projection, checked_geometry, rigid_gradient
+from .project import CameraLike, Projection, checked_geometry, geometry_of, rigid_gradient
 from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
 from .view_color import check_view_color, lettered
 from .view_kinds import entry_of
@@ -178,7 +178,7 @@ def training_view(
         RuntimeError: 2^31 pairs of surfel and tile or more, or not a CUDA device.
         ValueError: as `project`, `view_color`, `picture_losses` and `blended_image`.
     """
-    geometry = checked_geometry([surfels[name] for name in GEOMETRY], camera)
+    geometry = checked_geometry(geometry_of(surfels), camera)
     means = geometry[0]
     check_view_color(kind, surfels, len(means))
     photograph.check(means, (camera.height, camera.width))

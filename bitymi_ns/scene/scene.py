@@ -30,6 +30,7 @@ from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.constants import IMAGE_CHANNELS
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.picture_cuda import PhotographTarget
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.ops.training_view import ComparedView, training_view
 
 from .camera import Camera
@@ -182,7 +183,7 @@ class Scene(nn.Module):
         learns, bound = field_mode == "train", self.config.weight_bound
         descent = descent if learns else None
         alpha = None if self.field is None else self.field.opacity(bound, learns)
-        projection = project(*(p[name] for name in GEOMETRY), camera=camera, near=self.near, alpha=alpha)
+        projection = project(*geometry_of(p), camera=camera, near=self.near, alpha=alpha)
         texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode, descent)
         base = self.base_color(projection)
         if texture is not None:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bitymi_ns.ops import TexelAlpha, project, surfel_coverage
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ops.parameters import GEOMETRY
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 
@@ -71,7 +71,7 @@ def visibility(
         alpha: opacities of the surfels' texels; None: opaque texels.
     """
     means = surfels["means"]
-    geometry = [surfels[name] for name in GEOMETRY]
+    geometry = geometry_of(surfels)
     largest, pixels = means.new_zeros(2, len(means))
     squares = torch.zeros(len(cameras), len(means), dtype=torch.bfloat16, device=means.device)
     for done, camera in enumerate(cameras, start=1):

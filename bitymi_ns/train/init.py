@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.constants import COLOR_BIAS
+from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
 from bitymi_ns.ops.view_kinds import entry_of
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.config import SceneConfig
@@ -18,7 +19,6 @@ from bitymi_ns.train.background_points import BackgroundPoints, background_point
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import View
 
-BETA_RAW = 2.0  # nearly Gaussian kernels at the start: beta = 4 sigmoid(2) = 3.52
 MAX_SCALE = 0.25
 """Largest initial scale, as a share of the larger of scene extent and distance to the nearest camera."""
 PIXELS_PER_FIRST_SURFEL = 1000  # minimum number of pixels rendered in a run per initial surfel
@@ -134,7 +134,7 @@ def surfels_from_points(
         "quats": _orientation(to_camera, generator),
         "log_scales": scales.log()[:, None].repeat(1, 2),
         "opacity_logits": torch.full((n,), logit),
-        "beta_raw": torch.full((n,), BETA_RAW),
+        **{p.name: torch.full((n, *p.shape), p.start) for p in GEOMETRY_PARAMETERS.values() if p.start is not None},
         **entry_of(scene_config.view_color).first_values(rgb - COLOR_BIAS, scene_config, generator),
     }
     return surfels, report

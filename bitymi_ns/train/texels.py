@@ -15,7 +15,7 @@ from torch.utils.hooks import RemovableHandle
 from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.ops import TexelDescent, add_texel_coverage, project
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ops.parameters import GEOMETRY
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
@@ -264,7 +264,7 @@ def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
     """Sum blending weight times bilinear weight of each texel, [T] pixels, over unmasked fragments and views."""
     covered = field.texels.new_zeros(len(field.texels), 2)
     for view in views:
-        geometry = (scene.surfels[name].detach() for name in GEOMETRY)
+        geometry = (value.detach() for value in geometry_of(scene.surfels))
         camera = view.camera.to(covered.device)
         projection = project(*geometry, camera=camera, near=scene.near)
         add_texel_coverage(projection, field.tiles, view.mask, scene.config.weight_bound, covered)

@@ -25,6 +25,7 @@ from bitymi_ns.measure.stability.scenes import (
 )
 from bitymi_ns.ops.backend import emulated_cuda, module
 from bitymi_ns.ops.parameters import GEOMETRY
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.ops.reference import extended
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
@@ -161,7 +162,7 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
     alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0) if way.alpha else None
-    projection = ops.project(*(leaves[key] for key in GEOMETRY), camera, near, alpha=alpha)
+    projection = ops.project(*geometry_of(leaves), camera, near, alpha=alpha)
     fragments = ops.trace(projection, way.rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
@@ -183,7 +184,7 @@ def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
-    geometry = [leaves[key] for key in GEOMETRY]
+    geometry = geometry_of(leaves)
     texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]
     tiles = tile_images(torch.cat(texels, 1)) if texels else None
     result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=way.rim)
@@ -261,7 +262,7 @@ def against_extended(case: SceneCase, backend: Backend | None = None, near: floa
         with backend.use():
             got = _by_kernels(rounded, backend.device, torch.float64, near, replace(PLAIN, rim=1e-30))
     names = ("alpha", "depth", "normal", "beta_map")
-    plain = {key: rounded.params[key].numpy() for key in GEOMETRY}
+    plain = {key: value.numpy() for key, value in zip(GEOMETRY, geometry_of(rounded.params), strict=True)}
 
     def run(params: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], extended.Extended]:
         result = extended.render([params[key] for key in GEOMETRY], rounded, near)

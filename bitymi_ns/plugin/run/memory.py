@@ -11,7 +11,7 @@ from bitymi_ns.bake.tuning_views import LEAST_KEPT
 from bitymi_ns.bake.view_colors import choice_bytes
 from bitymi_ns.ops import can_rasterize, project
 from bitymi_ns.ops.capacity import NUMBERS, free_memory
-from bitymi_ns.ops.parameters import GEOMETRY
+from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.plugin.console import say, warn
@@ -63,7 +63,7 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
     p, most = scene.surfels, 0
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
-        geometry = (p[name].cpu() for name in GEOMETRY)
+        geometry = (value.cpu() for value in geometry_of(p))
         most = max(most, count(project(*geometry, camera, scene.near)))
     device = p["means"].device
     capacity = int(free_memory(device)) // PER_CARD_FRAGMENT if device.type == "cuda" else MOST

@@ -158,10 +158,15 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const rows = new Table(data, vertex, 'vertex');
   const words = new Float32Array(rows.count * SURFEL_WORDS);
   const copy = (column: string, at: number): void => rows.into(column, words, at, SURFEL_WORDS);
-  for (const [column, at] of Object.entries(PLY)) copy(column, at);
-  const extent = info.atlas?.extent ?? EXTENT;
+  const fill = (at: number, value: number): void => {
+    for (let to = at; to < words.length; to += SURFEL_WORDS) words[to] = value;
+  };
+  for (const [column, [at, absent]] of Object.entries(PLY)) {
+    if (absent === null || rows.has(column)) copy(column, at);
+    else fill(at, absent);
+  }
   if (rows.has('tile_extent')) copy('tile_extent', WORD.extent);
-  else for (let at = WORD.extent; at < words.length; at += SURFEL_WORDS) words[at] = extent;
+  else fill(WORD.extent, info.atlas?.extent ?? EXTENT);
   const means = rows.has('residual_0');
   if (means) [0, 1, 2].forEach((c) => copy(`residual_${c}`, WORD.residual + c));
   tiles(rows, words, info);

@@ -27,18 +27,19 @@ export const FRAME = {
   weightBound: 27, offset: 28, scale: 29, atlas: 30, surfels: 32, kind: 33, layers: 34, show: 35, residuals: 36,
   photoPixel: 37, detail: 38,
 } as const;
-export const PLY = {
-  x: 0, y: 1, z: 2, rot_0: 4, rot_1: 5, rot_2: 6, rot_3: 7, scale_0: 8, scale_1: 9, opacity: 3, beta: 10,
-} as const;
+export const PLY: Record<string, readonly [number, number | null]> = {
+  x: [0, null], y: [1, null], z: [2, null], rot_0: [4, null], rot_1: [5, null], rot_2: [6, null], rot_3: [7, null],
+  scale_0: [8, null], scale_1: [9, null], opacity: [3, null], beta: [10, null],
+};
 export const COLUMNS = {
   place: 1, largest: 1, rotation: 3, log_scales: 2, opacity: 1, beta: 1, size: 1, residual: 3, alpha: 1, view_base: 3,
   extent: 1, view_count: 1,
 } as const;
 export const STEPPED: readonly string[] = ['place', 'rotation', 'log_scales', 'opacity', 'beta', 'extent', 'view_base', 'term_shape', 'term_color', 'residual'];
-export const LINEAR: Record<string, { at: number; limit: number; least: number | null }> = {
-  log_scales: { at: 8, limit: 104, least: null },
-  opacity: { at: 3, limit: 1e4, least: 0.00392156862745098 },
-  beta: { at: 10, limit: 1e4, least: 0.0009765625 },
+export const LINEAR: Record<string, { words: readonly number[]; limit: number } & Record<'least' | 'absent', number | null>> = {
+  log_scales: { words: [8, 9], limit: 104, least: null, absent: null },
+  opacity: { words: [3], limit: 1e4, least: 0.00392156862745098, absent: null },
+  beta: { words: [10], limit: 1e4, least: 0.0009765625, absent: null },
 };
 export const KINDS = { sv: 0, 'sv sites': 1, sh: 2, sb: 3, sg: 4 } as const;
 export const LEAN_WIDTH = { sv: 6, sh: 3, sb: 6, sg: 7 } as const;

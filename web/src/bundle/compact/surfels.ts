@@ -1,6 +1,6 @@
 // Decodes surfels.bin: docs/baking.md describes its columns, codec/surfel_codes.py writes them.
 import { DamagedBundle } from '../../errors';
-import type { CompactSurfels, Manifest, ViewKind } from '../manifest';
+import type { CompactSurfels, Manifest } from '../manifest';
 import { type Surfels, alphaWord, centred, originOf, setTerms, setTile } from '../surfels';
 import {
   COLOR_LIMIT,
@@ -31,13 +31,16 @@ const logit = (share: number, least: number): number => {
 };
 const sinh = (x: number): number => Math.sinh(within(x, BENT));
 
-function expected(kind: ViewKind, alpha: boolean): [string, number][] {
+function expected({ viewColor: kind, atlas, compact }: Manifest): [string, number][] {
+  const stated = new Set(compact!.columns.map((column) => column.name));
+  const lacking = (name: string): boolean =>
+    name === 'alpha' ? !atlas?.alphaScale : !stated.has(name) && typeof LINEAR[name]?.absent === 'number';
   const shapes = SHAPES[kind].limits.length;
   const terms: [string, number][] = [
     ['term_shape', shapes],
     ['term_color', LEAN_WIDTH[kind] - shapes],
   ];
-  return [...Object.entries(COLUMNS).filter(([name]) => alpha || name !== 'alpha'), ...terms];
+  return [...Object.entries(COLUMNS).filter(([name]) => !lacking(name)), ...terms];
 }
 
 // Extracts every third bit of a number below 2^27, from the lowest.
@@ -73,7 +76,7 @@ class Decoder {
     this.terms = info.terms ?? 0;
     this.alpha = Boolean(info.atlas?.alphaScale);
     const columns = this.stated.columns;
-    checkColumns(columns, expected(info.viewColor, this.alpha), data.length, FILE);
+    checkColumns(columns, expected(info), data.length, FILE);
     if (Math.max(this.count, this.terms) > SURFELS_PER_BYTE * data.length + SPARE_SURFELS) {
       throw new DamagedBundle(`${FILE}: ${this.count} surfels cannot be in ${data.length} bytes.`);
     }
@@ -139,11 +142,12 @@ class Decoder {
   }
 
   private linear(): void {
-    for (const [name, { at, limit, least }] of Object.entries(LINEAR)) {
-      const step = this.step(name);
-      this.column(name).forEach((codes, c) => {
-        for (let i = 0, to = at + c; i < this.count; i++, to += SURFEL_WORDS) {
-          this.words[to] = least === null ? within(step * codes[i], limit) : logit(step * codes[i], least);
+    for (const [name, { words, limit, least, absent }] of Object.entries(LINEAR)) {
+      const [columns, step] = [this.codes.get(name), this.step(name)];
+      words.forEach((at, c) => {
+        for (let i = 0, to = at; i < this.count; i++, to += SURFEL_WORDS) {
+          const value = columns ? step * columns[c][i] : absent!;
+          this.words[to] = columns && least !== null ? logit(value, least) : within(value, limit);
         }
       });
     }

@@ -31,11 +31,8 @@ BINPERSID
 
 
 def read_archive(file: BinaryIO) -> Any:
-    """Read what `torch.save` wrote: tables, lists, text, numbers and CPU tensors, equal to torch.load's.
-
-    Raises:
-        ValueError, pickle.UnpicklingError and what zipfile raises: it is damaged, or holds anything else.
-    """
+    """Read what `torch.save` wrote: tables, lists, text, numbers and CPU tensors, equal to torch.load's. Raises
+    ValueError, pickle.UnpicklingError and what zipfile raises: it is damaged, or holds anything else."""
     with ZipFile(file) as archive:
         parts = archive.infolist()
         names = [part.filename for part in parts]

@@ -79,17 +79,9 @@ def state_training(
     processes: int = 1,
     lists: bool = False,
 ) -> None:
-    """Print the memory estimate of a training run.
-
-    Args:
-        scene: at the start.
-        cameras: of the training views, on the CPU.
-        most_surfels: expected largest number of surfels.
-        texels: options of texels that learn in training; None = none learn.
-        to_come: number of renders from which texels learn.
-        processes: of equal need on this machine.
-        lists: losses need lists of fragments on a card, too.
-    """
+    """Print the memory estimate of a training run, from its `scene` at the start, the cameras of its views, on the CPU,
+    and the expected largest number of surfels. `texels`: options of those that learn (None = none), from `to_come`
+    renders. `processes`: of equal need on this machine. `lists`: losses need lists of fragments on a card, too."""
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
     card = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
@@ -123,14 +115,9 @@ def state_training(
 def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
-    """Print the memory estimate of an export.
-
-    Args:
-        cameras: of the training views, on the CPU.
-        finetune_bytes: for the views that the fine-tuning keeps; 0 = no fine-tuning.
-        learning: number of surfels that learn in the polish; 0 = no polish.
-        compact: the bundle is compact, so that terms of view colours are chosen by rate-distortion.
-    """
+    """Print the memory estimate of an export, from the cameras of the training views, on the CPU. `finetune_bytes`: for
+    the views that the fine-tuning keeps; 0 = no fine-tuning. `learning`: number of surfels that learn in the polish; 0
+    = no polish. `compact`: terms of view colours are chosen by rate-distortion."""
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     fragments = most_fragments(scene, cameras)

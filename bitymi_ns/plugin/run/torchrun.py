@@ -41,11 +41,8 @@ def own(group: str = "") -> Processes:
 
 
 def run(config: TrainerConfig) -> NoReturn:
-    """Start the processes of a run with torchrun, wait for them, and exit with their status.
-
-    Raises:
-        SystemExit: always; with a message where no process has printed one.
-    """
+    """Start the processes of a run with torchrun, wait for them, and exit with their status; with a message where no
+    process has printed one."""
     from torch.distributed.launcher.api import ChildFailedError, SignalException
     from torch.distributed.run import main as torchrun
 
@@ -76,12 +73,8 @@ def run(config: TrainerConfig) -> NoReturn:
 
 
 def end(statuses: dict[int, int], count: int) -> NoReturn:
-    """Exit with the status of the process that failed first, and print a message unless it has printed one.
-
-    Args:
-        statuses: rank -> exit status, in the order in which torchrun noticed them; negative: killed by that signal.
-        count: number of processes of the run.
-    """
+    """Exit with the status of the process that failed first, and print a message unless it has printed one. `statuses`:
+    by rank, in the order in which torchrun noticed them; negative: killed by that signal. `count`: of processes."""
     rank, status = next(((r, s) for r, s in statuses.items() if s != LOST), (0, LOST))
     if status == LOST:
         fail(f"the {count} processes of this run lost contact, or one did not answer for {TIMEOUT}")
@@ -109,11 +102,7 @@ def work() -> None:
 
 def join(config: TrainerConfig) -> None:
     """Join torch.distributed's default group: gloo for CPU tensors, nccl for CUDA tensors. The other processes take the
-    configuration of the first.
-
-    Raises:
-        InputError: another process has ended.
-    """
+    configuration of the first. Raises InputError: another process has ended."""
     try:
         with raise_process_lost():
             store, rank, count = next(dist.rendezvous("env://", timeout=SETUP))

@@ -140,12 +140,15 @@ class Capture:
     model: Source | None = None  # found by structure from motion; None = the capture came with poses
 
 
-def read_capture(options: CaptureOptions, need_photos: bool = True, want_points: bool = True) -> Capture:
+def read_capture(
+    options: CaptureOptions, need_photos: bool = True, want_points: bool = True, found: Found | None = None
+) -> Capture:
     """Read a capture of any format, and check all that its files state. `need_photos`: fail if photographs are missing,
-    else their files are not opened; `want_points`: color the points, and triangulate missing ones. Raises CaptureError:
-    it cannot be used; names the file and the entry, and says what to do."""
+    else their files are not opened; `want_points`: color the points, and triangulate missing ones; `found`: what
+    `options.find` has found. Raises CaptureError: it cannot be used; names the file and the entry, and says what to
+    do."""
     try:
-        return _Reader(options, options.find(), need_photos, want_points).read()
+        return _Reader(options, found or options.find(), need_photos, want_points).read()
     except OSError as error:
         fail(line_of(error) or str(error), error)
 

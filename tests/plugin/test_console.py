@@ -58,7 +58,7 @@ def test_a_run_without_a_terminal_prints_what_it_is_and_a_line_a_report(
 def test_a_training_reads_its_capture_once(
     capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    calls = {"read_transforms": 0, "as_meant": 0}
+    calls = {"recognise": 0, "read_transforms": 0, "as_meant": 0}
 
     def count(name: str, function: Any, *given: Any) -> Any:
         calls[name] += 1

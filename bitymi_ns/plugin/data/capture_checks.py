@@ -81,11 +81,12 @@ def check_capture(config: FullImageDatamanagerConfig, trains: bool = True) -> No
 def read_early(config: FullImageDatamanagerConfig) -> Capture | None:
     """Read the views of a checked capture for a training, if it comes with poses, which takes little time; else None.
     Raises InputError: it cannot be used."""
-    dataparser = config.dataparser
-    if not isinstance(dataparser, BitymiDataParserConfig) or dataparser.find().format in ("photographs", "video"):
+    if not isinstance(config.dataparser, BitymiDataParserConfig):
+        return None
+    parser = config.dataparser.prepare(points=True)
+    if parser.found.format in ("photographs", "video"):
         return None
     with reporting_input_errors(config):
-        parser = dataparser.prepare(points=True)
         _ = parser.outputs
     return parser.capture
 

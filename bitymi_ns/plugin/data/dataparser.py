@@ -19,6 +19,7 @@ from bitymi_ns.capture import splits
 from bitymi_ns.capture.lens import Pinhole
 from bitymi_ns.capture.read import Capture, CaptureOptions, read_capture
 from bitymi_ns.capture.readings import WRITTEN
+from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import OPENCV_AXES
 from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.plugin.data.depth import DepthKind
@@ -81,9 +82,14 @@ class BitymiDataParser(DataParser):
         self.downscale_factor: int | None = None  # set by nerfstudio if photographs are not needed: none is opened then
 
     @cached_property
+    def found(self) -> Found:
+        """What the capture is recognized as; once."""
+        return self.config.find()
+
+    @cached_property
     def capture(self) -> Capture:
         """The capture; read once."""
-        return read_capture(self.config, self.downscale_factor is None, self.points)
+        return read_capture(self.config, self.downscale_factor is None, self.points, self.found)
 
     @cached_property
     @as_input_error()

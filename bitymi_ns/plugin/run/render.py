@@ -60,10 +60,6 @@ def check_evaluation(command: Any) -> None:
             check_folder(folder)
 
 
-def _spiral_frames(command: Any) -> int:
-    return int(command.frame_rate * command.seconds)
-
-
 def target_of(command: Any) -> Path:
     """Name the output: films without an extension get .mp4, folders nerfstudio's names."""
     path = Path(command.output_path)
@@ -114,7 +110,7 @@ def check_options(command: Any) -> None:
         if as_film and not RATES[0] <= path.rate <= RATES[1]:
             fail(f"{command.camera_path_filename} makes {path.rate:g} frames per second: correct its seconds.")
         command.camera_path_filename = path.written()
-    elif getattr(command, "seconds", None) is not None and _spiral_frames(command) < 1:
+    elif getattr(command, "seconds", None) is not None and int(command.frame_rate * command.seconds) < 1:
         fail(f"{command.seconds} seconds have no frame at --frame-rate {command.frame_rate}: give more.")
 
 
@@ -191,7 +187,7 @@ def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cam
 def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds: float) -> None:
     """Render a path, or a spiral, as a film or frames, whole or not at all. Raises InputError: it cannot be written."""
     if hasattr(command, "radius"):
-        cameras = spiral(model, cameras, _spiral_frames(command), command.radius)
+        cameras = spiral(model, cameras, int(command.frame_rate * command.seconds), command.radius)
     fps = len(cameras) / seconds if hasattr(command, "camera_path_filename") else float(command.frame_rate)
     target, names = target_of(command), command.rendered_output_names
     images, started = command.output_format == "images", time.monotonic()

@@ -28,7 +28,7 @@ from bitymi_ns.trust import finite_numbers, json_of
 MAX_BYTES = 64 << 20  # larger files are not evaluations
 MAX_DEPTH = 8  # levels of folders that are searched
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
-_NOT_OF_A_RUN = ("cell", "bundle", "export", "pictures", "views")
+_NOT_OF_A_RUN = ("cell", "bundle", "export")
 
 
 def parse_json(text: str, where: str) -> Any:

@@ -52,14 +52,15 @@ class RollbackGuard:
         poses: Poses,
         announce: Callable[[str], None],
     ) -> None:
-        self.scene, self.optimizers, self.strategy = scene, optimizers, strategy
-        self.exposure, self.poses, self.announce = exposure, poses, announce
-        self.schedule, self.config, self.processes = strategy.schedule, strategy.config, strategy.processes
-        self.window = max(self.config.guard.min_window, self.schedule.scaled(self.config.guard.window))
+        self.scene, self.optimizers, self.strategy, self.announce = scene, optimizers, strategy, announce
+        self.exposure, self.poses = exposure, poses
+        self.schedule, self.options = strategy.schedule, strategy.config.guard
+        self.on = self.options.rollbacks > 0
+        self.window = max(self.options.min_window, self.schedule.scaled(self.options.window))
         self.factor, self.rollbacks = 1.0, 0
         self._limit = math.nan  # loss of blank images, or of the initial scene
         self._views = 0  # number of training views
-        self._sum, self._count = torch.zeros(()), 0  # of losses, on the scene's device to avoid synchronisation
+        self._sum, self._count = 0.0, 0  # of losses; stays on their device to avoid synchronisation
         self._states: list[tuple[int, dict[str, Any]]] = []  # (step, state); the older one is known to be good
 
     def state_dict(self) -> dict[str, Any]:
@@ -70,13 +71,8 @@ class RollbackGuard:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restore what `state_dict` returned."""
         self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
-        self._limit, self._sum, self._count = float(state["limit"]), torch.tensor(state["sum"]), int(state["count"])
+        self._limit, self._sum, self._count = float(state["limit"]), float(state["sum"]), int(state["count"])
         self._states = []
-
-    @property
-    def on(self) -> bool:
-        """True if rollbacks are enabled."""
-        return self.config.guard.rollbacks > 0
 
     def before(self, step: int, views: DownscaledViews) -> None:
         """Capture a state if there is none, and measure the loss of the initial scene and of blank images once; call it
@@ -90,7 +86,7 @@ class RollbackGuard:
 
     def restart(self) -> None:
         """Discard captured states and start a new window, when the scene's texture becomes texels."""
-        self._states, self._sum, self._count = [], torch.zeros_like(self._sum), 0
+        self._states, self._sum, self._count = [], 0.0, 0
 
     @torch.no_grad()
     def _loss_of(self, views: DownscaledViews) -> float:
@@ -100,14 +96,14 @@ class RollbackGuard:
         for i in spread(len(views), COMPARED_VIEWS):
             view = views.at(i, 1.0)
             # as in training steps, but always the same colours if they are random
-            background = step_background(self.config, view, i, device)
+            background = step_background(self.strategy.config, view, i, device)
             target = view.target(background, device)
             output = self.scene.render(view.camera.to(device), background=background, field_mode="frozen")
             images = (view.shown(output.rgb, output.alpha, background), target.mean((0, 1)).expand_as(target))
             del output  # frees its fragments before the next view is rendered
-            weight = self.config.loss.ssim_weight
+            weight = self.strategy.config.loss.ssim_weight
             losses.append(torch.stack([photometric(x.contiguous(), target, weight, view.mask) for x in images]))
-        return max(self.processes.mean(float(loss)) for loss in torch.stack(losses).mean(0))
+        return max(self.strategy.processes.mean(float(loss)) for loss in torch.stack(losses).mean(0))
 
     def failed(self, step: int, error: TrainingDiverged) -> dict[str, float]:
         """Repair the scene after a loss that is not finite (the step is then repeated), or after an update broke it.
@@ -124,16 +120,15 @@ class RollbackGuard:
         if not self.on:
             return {}
         if self.schedule.recovering(step):
-            self._sum, self._count = torch.zeros_like(loss), 0
+            self._sum, self._count = 0.0, 0
         else:
-            self._sum, self._count = self._sum.to(loss) + loss, self._count + 1
+            self._sum, self._count = self._sum + loss, self._count + 1
         left = self.schedule.max_steps - 1 - step
         if left % self.window:  # the last window ends with the run
             return {}
-        mean, count = float(self._sum) / max(1, self._count), self._count
-        self._sum, self._count = torch.zeros_like(loss), 0
+        mean, enough = float(self._sum) / max(1, self._count), self._count >= self.options.min_window
+        self._sum, self._count = 0.0, 0
         early = step < max(EARLY * self.schedule.max_steps, EARLY_STEPS)
-        enough = count >= self.config.guard.min_window
         if enough and mean > self._limit * (WORSE if early else 1.0):
             return self._go_back(step, f"the views are drawn worse than blank ones (loss {mean:.3f})")
         if cause := describe_broken(self.scene):
@@ -155,17 +150,16 @@ class RollbackGuard:
         return {"not_finite": dropped, "surfels": float(len(self.scene))}
 
     def _go_back(self, step: int, cause: str) -> dict[str, float]:
-        options = self.config.guard
-        if self.rollbacks >= options.rollbacks or not self._states:
+        if self.rollbacks >= self.options.rollbacks or not self._states:
             tried = f" It went back {self.rollbacks} times, to learning rates times {self.factor:.2g}."
             tried = tried if self.rollbacks else ""
             raise TrainingDiverged(f"training diverged at step {step}: {cause}.{tried} Lower the learning rates")
         del self._states[1:]
-        ((origin, state),) = self._states
+        origin, state = self._states[0]
         self.rollbacks += 1
-        self.factor *= options.rates
+        self.factor *= self.options.rates
         self._restore(state)
-        self._sum, self._count = torch.zeros_like(self._sum), 0
+        self._sum, self._count = 0.0, 0
         self.announce(
             f"step {step}: training diverged ({cause}); back to the state before step {origin}, "
             f"with learning rates times {self.factor:.2g} from here on"
@@ -173,32 +167,29 @@ class RollbackGuard:
         return {"rolled_back": float(step - origin), "rates": self.factor, "surfels": float(len(self.scene))}
 
     def _capture(self) -> dict[str, Any]:
-        # texels dominate the memory of a state: buffers that never change in place are shared between states, and
-        # texels are kept in half precision, whose error of 2^-11 of a residual is invisible
-        scene = {name: value.detach() for name, value in self.scene.state_dict().items()}
-        if isinstance(self.scene.field, TexelField):
-            shared = {f"field.{name}" for name in TexelField.STEADY}
-            halved = scene | {"field.texels": scene["field.texels"].half()}
-            scene = {name: value if name in shared else value.clone() for name, value in halved.items()}
-        else:
-            scene = {name: value.clone() for name, value in scene.items()}
-        parts = {"strategy": self.strategy, "exposure": self.exposure, "poses": self.poses}
-        states = {name: part.state_dict() for name, part in parts.items()}
-        optimizers = {name: copy.deepcopy(o.state_dict()) for name, o in self.optimizers.items()}
-        return {"scene": scene, "optimizers": optimizers, **states}
+        # texels dominate a state: their steady buffers are shared between states, and they are kept in half precision,
+        # whose error of 2^-11 of a residual is invisible
+        texels = isinstance(self.scene.field, TexelField)
+        shared = {f"field.{name}" for name in TexelField.STEADY} if texels else {}
+        scene = {
+            name: value if name in shared else value.half() if name == "field.texels" else value.clone()
+            for name, value in self.scene.state_dict().items()
+        }
+        parts = {"strategy": self.strategy, "exposure": self.exposure, "poses": self.poses} | dict(self.optimizers)
+        return {"scene": scene} | {name: copy.deepcopy(part.state_dict()) for name, part in parts.items()}
 
     def _restore(self, state: Mapping[str, Any]) -> None:
         # new Parameters, as a live autograd graph relies on the shapes of the old ones
         surfels = self.scene.surfels
         rows = {name: state["scene"][f"surfels.{name}"] for name in surfels.keys()}
-        none = torch.zeros(0, dtype=torch.int64, device=surfels["means"].device)
+        none = surfels["means"].new_zeros(0, dtype=torch.int64)
         replace_rows(surfels, self.optimizers, none, rows, self.strategy.on_resize)
         if isinstance(self.scene.field, TexelField):
             self.scene.resize_for_state(state["scene"])
         self.scene.load_state_dict(state["scene"])
         self.scene.zero_grad(set_to_none=True)
         for name, optimizer in self.optimizers.items():
-            optimizer.load_state_dict(copy.deepcopy(state["optimizers"][name]))
+            optimizer.load_state_dict(copy.deepcopy(state[name]))
         self.strategy.load_state_dict(state["strategy"])
         self.poses.load_state_dict(state["poses"])
         self.exposure.load_state_dict(state["exposure"], self._views, surfels["means"].device)

@@ -17,7 +17,7 @@ from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.pages import joined, tile_means
 from bitymi_ns.codec.surfel_codes import code_surfels
-from bitymi_ns.codec.texel_codes import TexelCodeOptions, TexelCoder, TexelCodes, residual_codes
+from bitymi_ns.codec.texel_codes import TexelCoder, TexelCodes, residual_codes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.views import View
 
@@ -141,13 +141,13 @@ class Coder:
         surfels = {**baked.scene.surfels, **self._view_colors(lmbda)}
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
         codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)
-        coding = TexelCodeOptions(step=min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * lmbda / PER_BIT))))
+        step = min(1000.0, max(0.01, 255 * math.sqrt(TEXEL_SHARE * 12 * lmbda / PER_BIT)))
         listed = decoded = means = self._residual[order]
         coverage, coded = self._coverage, None
         if self._tiles is not None:
             moved = self._tiles.rows_of(order.to(baked.device)).cpu()
             texels, coverage = baked.texels[moved, :3], coverage[moved]
-            coder = TexelCoder(self._sizes[order], coverage[:, 1], coding)
+            coder = TexelCoder(self._sizes[order], coverage[:, 1], step)
             alphas = None if baked.alpha is None else coder.code_alpha(baked.alpha.values[moved])
             coded, listed = coder.code(texels), joined(texels, alphas)
             decoded, means = joined(coded.texels_of(coder.blocks), alphas), coded.means
@@ -157,7 +157,7 @@ class Coder:
             rows=baked.rows[order],
             in_front=baked.in_front[order],
             codes=codes,
-            coding=coding,
+            step=step,
             alpha_codes=None if baked.alpha is None else coded,
             coverage=coverage,
             **laid_out(scene, Tiles(self._sizes[order], codes.extent(baked.options.extent), listed), baked.options),
@@ -219,7 +219,7 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
     baked = found.baked
     if options.most_bytes is not None:
         most, binds = options.most_bytes - baked.codes.nbytes(), found.error > enough
-        baked = replace(baked, coding=replace(baked.coding, most_bytes=most, fill=binds))
+        baked = replace(baked, most_bytes=most, fill=binds)
     mse = max(0.0, found.error - coder.error) if coder.measured else None
     rounding = Rounding(mse=mse, steps=dict(baked.codes.steps), alternatives=_alternatives(coder, found))
     return baked.stating(rounding=rounding, view_color=_thinned(baked))

@@ -21,7 +21,7 @@ from bitymi_ns.scene.camera import Camera
 
 def drawable(surfels: Tensors) -> tuple[Tensor, LeftOut]:
     """Find the rows [N] int64 that can be drawn and stored; count those left out, by reason."""
-    finite = torch.stack([torch.isfinite(value).flatten(1).all(1) for value in _as_rows(surfels)]).all(0)
+    finite = torch.stack([value.isfinite().unsqueeze(-1).flatten(1).all(1) for _, value in surfels.items()]).all(0)
     scales = surfels["log_scales"].exp()
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
     turned = surfels["quats"].norm(dim=1)
@@ -34,11 +34,6 @@ def drawable(surfels: Tensors) -> tuple[Tensor, LeftOut]:
         beyond_limits=int((finite & ~storable).sum()),
         transparent=int(transparent.sum()),
     )
-
-
-def _as_rows(surfels: Tensors) -> list[Tensor]:
-    """Give every parameter at least two dimensions."""
-    return [value.detach() if value.dim() > 1 else value.detach()[:, None] for _, value in surfels.items()]
 
 
 def drop_unseen(

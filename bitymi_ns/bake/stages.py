@@ -34,7 +34,6 @@ from bitymi_ns.codec.surfel_codes import Codes, SurfelCodes
 from bitymi_ns.codec.texel_codes import (
     RESIDUAL_STEP,
     SceneCodes,
-    TexelCodeOptions,
     TexelCoder,
     TexelCodes,
     residual_codes,
@@ -169,7 +168,11 @@ class Rounded(Stage):
 
     in_front: Tensor  # as of `Reduced`
     codes: SurfelCodes  # from which the surfels are decoded
-    coding: TexelCodeOptions  # of the texels
+    step: float  # of the texels, see `TexelCoder`
+    most_bytes: int | None = None
+    """Largest size of the texels with their residuals and mean alphas; the step grows until they fit. None: no
+    limit."""
+    fill: bool = False  # the step also shrinks during fine-tuning, until nearly `most_bytes` are used
     alpha_codes: TexelCodes | None  # codes whose alphas and grades are kept; None = opaque
     # [T, 2] in pixels, the sums over views and fragments of w b and w^2 b, with blending weight w and bilinear weight b
     coverage: Tensor
@@ -179,8 +182,7 @@ class Rounded(Stage):
         colors = self.texels[:, :3].contiguous()
         if not self.textured:
             return _coded(self, colors, codes=self._codes(None, residual_codes(colors), RESIDUAL_STEP))
-        coder = TexelCoder(self.sizes, torch.ones(len(colors)), self.coding, self.alpha_codes)
-        most = self.coding.most_bytes
+        coder, most = TexelCoder(self.sizes, torch.ones(len(colors)), self.step, self.alpha_codes), self.most_bytes
         return self.coded(coder.code(colors) if most is None else coder.fit(colors, most), colors)
 
     def coded(self, texels: TexelCodes, colors: Tensor) -> Coded:

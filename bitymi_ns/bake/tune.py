@@ -52,8 +52,8 @@ class Cosines:
     """Coder of texels for a compact bundle, within the limit of bytes of its coding."""
 
     def __init__(self, baked: Rounded, weights: Tensor) -> None:
-        self._baked, self._most, self._fill = baked, baked.coding.most_bytes, baked.coding.fill
-        self._coder = TexelCoder(baked.sizes, weights, baked.coding, baked.alpha_codes)
+        self._baked, self._most, self._fill = baked, baked.most_bytes, baked.fill
+        self._coder = TexelCoder(baked.sizes, weights, baked.step, baked.alpha_codes)
 
     def first(self, texels: Tensor) -> StoredTexels[TexelCodes]:
         """Code the initial texels [T, 3]."""

@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
@@ -76,11 +77,7 @@ def points_of(text: str) -> Tensor:
         raise PydanticCustomError(
             "points", "must hold rows of four float32 numbers, at most {most}", {"most": _MOST_POINTS}
         )
-    points = (
-        torch.frombuffer(bytearray(data), dtype=torch.float32).view(-1, 4)
-        if data
-        else torch.zeros(0, 4, dtype=torch.float32)
-    )
+    points = torch.from_numpy(np.frombuffer(bytearray(data), "<f4").reshape(-1, 4))
     low, high = _RATES
     good = (points[:, :3].abs() <= LIMITS["means"][0]).all() and ((points[:, 3] >= low) & (points[:, 3] <= high)).all()
     if not bool(good):  # also for NaN

@@ -10,7 +10,7 @@ Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms (nu
 surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.codec.limits import ALPHA_LIMIT, EXTENTS, UNIT_SLACK, beyond, limit_of
+from bitymi_ns.codec.surfel_codes import term_rows
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0, SUPPORT
 from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
@@ -99,12 +100,9 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
 
 def term_columns(surfels: Mapping[str, Tensor]) -> dict[str, npt.NDArray]:
     """Convert the terms of lean view colours to columns, surfel after surfel: term_0, term_1, ...; [T] float32."""
-    first, count = surfels["view_span"].long().cpu().unbind(1)
-    terms = surfels["view_terms"].detach().float().cpu()
-    start = count.cumsum(0) - count  # spans may lie anywhere, the file has them in order
-    inside = torch.arange(int(count.sum())) - start.repeat_interleave(count)
-    ordered = terms[first.repeat_interleave(count) + inside]
-    return {name: ordered[:, i].numpy() for i, name in enumerate(_numbered("term", terms.shape[1]))}
+    span = surfels["view_span"].long().cpu().numpy()  # spans may lie anywhere, the file has them in order
+    ordered = surfels["view_terms"].detach().float().cpu().numpy()[term_rows(span)]
+    return {name: ordered[:, i] for i, name in enumerate(_numbered("term", ordered.shape[1]))}
 
 
 def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: float) -> Tensor:
@@ -116,8 +114,8 @@ def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: fl
     return values
 
 
-def first_fault(surfels: Mapping[str, Tensor], kind: str) -> str | None:
-    """Describe the first number beyond its limit (`limits.LIMITS`), by column and row of surfels.ply; None if none.
+def check_limits(surfels: Mapping[str, Tensor], kind: str, refuse: Callable[[str], Exception] = PlyError) -> None:
+    """Raise `refuse` of a line with column and row of surfels.ply if a number is beyond its limit (`limits.LIMITS`).
     `surfels`: parameters by name, including mean_residual. `kind`: a name of `ops.VIEW_COLORS`."""
     for name, values in surfels.items():
         bad = beyond(name, kind, values)
@@ -128,14 +126,7 @@ def first_fault(surfels: Mapping[str, Tensor], kind: str) -> str | None:
             bound = largest[inner[-1] if len(largest) > 1 else 0]
             value = float(values[(row, *inner)])
             column = COLUMNS[name][index] if name in COLUMNS else f"{name}_{index}"
-            return f"{column} is {value:g} in row {row}; it must be from {-bound:g} to {bound:g}"
-    return None
-
-
-def _check_limits(surfels: Mapping[str, Tensor], kind: str) -> None:
-    problem = first_fault(surfels, kind)
-    if problem is not None:
-        raise PlyError(problem)
+            raise refuse(f"{column} is {value:g} in row {row}; it must be from {-bound:g} to {bound:g}")
 
 
 def from_columns(
@@ -176,21 +167,21 @@ def from_columns(
         surfels |= _lean_from_columns(columns, terms, kind)
     else:
         surfels |= _full_from_columns(columns, kind, count)
-    _check_limits(surfels, kind)
+    check_limits(surfels, kind)
     turned = (surfels["quats"].norm(dim=1) - 1.0).abs() > UNIT_SLACK
     if turned.any():
         raise PlyError(f"rot_0 to rot_3 are not of length 1 in row {int(torch.nonzero(turned)[0])}")
     residual = torch.zeros(count, 3, dtype=torch.float32)
     if COLUMNS["mean_residual"][0] in columns:
         residual = _stack(columns, COLUMNS["mean_residual"])
-        _check_limits({"mean_residual": residual}, kind)
-    stated = EXTENT_COLUMN in columns
+        check_limits({"mean_residual": residual}, kind)
+    extents = torch.full((count,), extent, dtype=torch.float32)
+    if EXTENT_COLUMN in columns:
+        extents = _bounded(columns, EXTENT_COLUMN, *EXTENTS)
     return {
         "surfels": surfels,
         "tiles": tiles.contiguous(),
-        "extent": _bounded(columns, EXTENT_COLUMN, *EXTENTS)
-        if stated
-        else torch.full((count,), extent, dtype=torch.float32),
+        "extent": extents,
         "mean_residual": residual,
         "mean_alpha": _bounded(columns, ALPHA_COLUMN, 0.0, ALPHA_LIMIT) if has_alpha else None,
     }

@@ -31,7 +31,7 @@ from bitymi_ns.bundle.manifest import (
 from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
 from bitymi_ns.bundle.poster import Pixels, encode_poster, most_bytes
 from bitymi_ns.bundle.read import Bundle, read_bundle, read_manifest
-from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, first_fault, term_columns, to_columns
+from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, check_limits, term_columns, to_columns
 from bitymi_ns.bundle.world import World, same_frame
 from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.codec.quantise import Atlas, EncodedAtlas
@@ -234,13 +234,10 @@ def _check_surfels(scene: BakedScene) -> None:
     for name, value in surfels.items():
         if name != "view_terms" and len(value) != len(tiles):
             raise BundleError(f"{name} has {len(value)} rows, the tiles have {len(tiles)}")
-        finite = torch.isfinite(value).flatten(1).all(1) if value.dim() > 1 else torch.isfinite(value)
+        finite = torch.isfinite(value).unsqueeze(-1).flatten(1).all(1)
         if not finite.all():
             raise BundleError(f"{name} is not finite in row {int(torch.nonzero(~finite)[0])}")
-    stored = dict(surfels) if mean_residual is None else {**surfels, "mean_residual": mean_residual}
-    problem = first_fault(stored, kind)
-    if problem is not None:
-        raise BundleError(problem)
+    check_limits({**surfels, **({} if mean_residual is None else {"mean_residual": mean_residual})}, kind, BundleError)
     turned = surfels["quats"].norm(dim=1) > 1e-12
     if not turned.all():
         raise BundleError(f"quats has the length 0 in row {int(torch.nonzero(~turned)[0])}")

@@ -36,12 +36,11 @@ def beyond(name: str, kind: str, values: Tensor) -> Tensor:
     """Compute the mask of values beyond the limit of their parameter: bool, of the shape of `values`. `name` and
     `kind`: as in `limit_of`. `values`: [N] or [N, ...]."""
     largest = limit_of(name, kind)
-    return values.abs() > (
-        torch.tensor(largest, device=values.device, dtype=torch.float32) if values.dim() > 1 else largest[0]
-    )
+    most = torch.tensor(largest, device=values.device, dtype=torch.float32) if values.dim() > 1 else largest[0]
+    return values.abs() > most
 
 
 def within(surfels: Tensors, kind: str) -> Tensor:
     """Compute the mask [N] of surfels whose parameters ([N, ...] each) all keep their limits."""
     bad = [beyond(name, kind, value.detach()) for name, value in surfels.items()]
-    return ~torch.stack([each.flatten(1).any(1) if each.dim() > 1 else each for each in bad]).any(0)
+    return ~torch.stack([each.unsqueeze(-1).flatten(1).any(1) for each in bad]).any(0)

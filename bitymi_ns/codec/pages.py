@@ -119,16 +119,12 @@ def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
         return None
     means = torch.ones(len(scene), dtype=torch.float32) if scene.mean_alpha is None else scene.mean_alpha.cpu()
     extent = torch.full_like(means, SUPPORT, device=device) if scene.extent is None else scene.extent.float()
-    if alphas is None:  # no atlas: constants only
-        sizes, values = torch.ones_like(scene.tiles[:, 3:]), means
-    else:
-        sizes, values = scene.tiles[:, 3:].clamp(min=1), _listed(scene, alphas[..., None], means[:, None])[:, 0]
+    sizes, values = torch.ones_like(scene.tiles[:, 3:]), means  # without an atlas: constants only
+    if alphas is not None:
+        layers, height, width = alphas.shape
+        packing = Packing(scene.tiles.cpu().numpy(), width, height, layers, 1.0)
+        sizes, values = scene.tiles[:, 3:].clamp(min=1), listed_texels(alphas[..., None], packing, means[:, None])[:, 0]
     return TexelAlpha(TexelTiles.of_sizes(sizes, extent), values.contiguous().to(device), scene.weight_bound)
-
-
-def _listed(scene: BakedScene, pages: Tensor, constants: Tensor) -> Tensor:
-    layers, height, width = pages.shape[:3]
-    return listed_texels(pages, Packing(scene.tiles.cpu().numpy(), width, height, layers, 1.0), constants)
 
 
 def covered_blocks(tiles: np.ndarray, width: int, height: int, layers: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.codec import streams
-from bitymi_ns.codec.limits import EXTENTS, LIMITS, limit_of
+from bitymi_ns.codec.limits import EXTENTS, limit_of
 from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS, SMALLEST_SHARE, Parameter
 from bitymi_ns.ops.view_color import LEAN
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
@@ -100,13 +100,13 @@ class SurfelCodes:
         entry, (colors, shapes) = VIEW_COLORS[self.kind], term_numbers(self.kind)
         terms = np.zeros((len(self.codes["term_color"]), entry.lean_width))
         count = self.codes["view_count"][:, 0]
-        terms[:, colors] = self.steps["term_color"] * _from_differences(self.codes["term_color"])
+        terms[:, colors] = self.steps["term_color"] * from_differences(self.codes["term_color"])
         terms[:, shapes] = _sinh(self._linear("term_shape"))
         values = {
             "means": self._means(),
             "quats": self._rotations(),
             **{parameter.name: self._values(column, parameter) for column, parameter in LINEAR.items()},
-            "view_base": self.steps["view_base"] * _from_differences(self.codes["view_base"]),
+            "view_base": self.steps["view_base"] * from_differences(self.codes["view_base"]),
             "view_terms": terms,
         }
         found = {name: _clip_to_limits(name, self.kind, value) for name, value in values.items()}
@@ -166,19 +166,19 @@ def code_surfels(
     per_surfel = {
         "place": position[:, None],
         "largest": largest[:, None],
-        "rotation": _quantise(rest, steps["rotation"]),
-        **{column: _quantise(_coded(values[p.name], p), steps[column]) for column, p in LINEAR.items()},
+        "rotation": quantised(rest, steps["rotation"]),
+        **{column: quantised(_coded(values[p.name], p), steps[column]) for column, p in LINEAR.items()},
         "size": np.where(tiled, 16 * exponents[:, 0] + exponents[:, 1], 0)[:, None],
-        "view_base": _to_differences(_quantise(values["view_base"], steps["view_base"])),
+        "view_base": to_differences(quantised(values["view_base"], steps["view_base"])),
         "view_count": values["view_span"][:, 1:].astype(np.int64),
     }
     codes = {name: np.ascontiguousarray(value[order]) for name, value in per_surfel.items()}
     tiles = order[tiled[order]]
-    codes["extent"] = _quantise(extent.double().numpy()[tiles, None], steps["extent"])
+    codes["extent"] = quantised(extent.double().numpy()[tiles, None], steps["extent"])
     colors, shapes = term_numbers(kind)
-    terms = values["view_terms"][_term_rows(values["view_span"].astype(np.int64)[order])]
-    codes["term_shape"] = _quantise(np.arcsinh(terms[:, shapes]), steps["term_shape"])
-    codes["term_color"] = _to_differences(_quantise(terms[:, colors], steps["term_color"]))
+    terms = values["view_terms"][term_rows(values["view_span"].astype(np.int64)[order])]
+    codes["term_shape"] = quantised(np.arcsinh(terms[:, shapes]), steps["term_shape"])
+    codes["term_color"] = to_differences(quantised(terms[:, colors], steps["term_color"]))
     return SurfelCodes(kind, frame, steps, codes), torch.from_numpy(order)
 
 
@@ -187,7 +187,7 @@ def reordered(surfels: Mapping[str, Tensor], order: Tensor) -> dict[str, Tensor]
     span = surfels["view_span"].long()[order]
     moved = {name: value[order].contiguous() for name, value in surfels.items() if name not in LEAN}
     moved["view_base"] = surfels["view_base"][order].contiguous()
-    moved["view_terms"] = surfels["view_terms"][torch.from_numpy(_term_rows(span.numpy()))].contiguous()
+    moved["view_terms"] = surfels["view_terms"][torch.from_numpy(term_rows(span.numpy()))].contiguous()
     moved["view_span"] = torch.stack([span[:, 1].cumsum(0) - span[:, 1], span[:, 1]], dim=1).int()
     return moved
 
@@ -223,14 +223,15 @@ def _grid_cells(means: npt.NDArray[np.float64], step: float) -> tuple[PositionGr
     return PositionGrid((x, y, z), scale, (low_x, low_y, low_z)), step, np.rint((bent - low) / step).astype(np.int64)
 
 
-def _term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """List the rows of the terms of spans [N, 2], surfel after surfel."""
     first, count = span[:, 0], span[:, 1]
     start = np.cumsum(count) - count
     return np.repeat(first - start, count) + np.arange(int(count.sum()))
 
 
-def _quantise(values: npt.NDArray[np.float64], step: float) -> Codes:
+def quantised(values: npt.NDArray[np.float64], step: float) -> Codes:
+    """Round to multiples of a step."""
     return np.rint(values / step).astype(np.int64)
 
 
@@ -238,13 +239,14 @@ def _coded(values: npt.NDArray[np.float64], parameter: Parameter) -> npt.NDArray
     return (values if parameter.least is None else _sigmoid(values)).reshape(len(values), parameter.width)
 
 
-def _to_differences(rgb: Codes) -> Codes:
+def to_differences(rgb: Codes) -> Codes:
     """Convert channels (r, g, b repeated) to green, red - green, blue - green."""
     r, g, b = (rgb[:, i::3] for i in range(3))
     return np.stack([g, r - g, b - g], axis=2).reshape(rgb.shape)
 
 
-def _from_differences(differences: Codes) -> Codes:
+def from_differences(differences: Codes) -> Codes:
+    """Invert `to_differences`."""
     g, r, b = (differences[:, i::3] for i in range(3))
     return np.stack([r + g, g, b + g], axis=2).reshape(differences.shape)
 
@@ -264,5 +266,5 @@ def _logit(share: npt.NDArray[np.float64], least: float) -> npt.NDArray[np.float
 
 def _clip_to_limits(name: str, kind: str, values: npt.NDArray[np.float64]) -> Tensor:
     """Clip to the limits of a bundle, which rounding may exceed, as float32."""
-    limit = np.array(limit_of(name, kind) if name == "view_terms" else LIMITS.get(name, (np.inf,)))
+    limit = np.array(limit_of(name, kind))
     return torch.from_numpy(np.clip(values, -limit, limit).astype(np.float32))

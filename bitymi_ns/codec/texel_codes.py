@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from scipy.fft import dct
 from torch import Tensor
 
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.limits import ALPHA_ONE, RESIDUAL_LIMIT
 from bitymi_ns.codec.pages import first_texels, joined, size_classes
-from bitymi_ns.codec.surfel_codes import SurfelCodes
+from bitymi_ns.codec.surfel_codes import SurfelCodes, from_differences, quantised, to_differences
 from bitymi_ns.ops import backend
 
 BLOCK = 8  # largest side of a transformed block, texels
 GRADES = (-8, 24)  # range of a tile's grade: its step is the common one times 2^(grade / 2)
 RESIDUAL_STEP = 4.0 / 255  # step of mean residuals
+STEP = 7.5  # of coefficients, 8-bit steps, where nothing decides it
 LEAST_WEIGHT = 1e-3  # added to the weight of a texel, pixels, so that unseen texels stay near their values
 SPARSE_ROUNDS = 8  # ISTA iterations, which shrink coefficients that only unseen texels need
 ALPHA_GAIN = 6.0
@@ -32,23 +34,8 @@ _SMALLEST_STEP, _LARGEST_STEP = 1e-5, 50.0
 # Brightness and two differences: orthonormal, so that errors keep their size.
 _OPPONENT = torch.tensor([[1.0, 1.0, 1.0], [1.0, 0.0, -1.0], [1.0, -2.0, 1.0]], dtype=torch.float32)
 _OPPONENT = _OPPONENT / _OPPONENT.norm(dim=1, keepdim=True)
-_CHANNELS = {
-    3: _OPPONENT,
-    1: torch.ones(1, 1, dtype=torch.float32),
-}  # transform of the channels, by their number (colours, alphas)
-
-
-@dataclass
-class TexelCodeOptions:
-    """Precision of coded texels."""
-
-    step: float = 7.5
-    """Step of a coefficient, in 8-bit steps, for texels that cover one pixel of the views; step / sqrt(w) if they cover
-    w pixels."""
-    most_bytes: int | None = None
-    """Largest size of the texels with their residuals and mean alphas; the step grows until they fit. None: no
-    limit."""
-    fill: bool = False  # the step also shrinks during fine-tuning, until nearly `most_bytes` are used
+# transform of the channels, by their number (colours, alphas)
+_CHANNELS = {3: _OPPONENT, 1: torch.ones(1, 1, dtype=torch.float32)}
 
 
 @dataclass(frozen=True)
@@ -184,15 +171,13 @@ def mean_alphas_of(mean: npt.NDArray[np.int64]) -> Tensor:
 
 def constants(residual: npt.NDArray[np.int64], step: float) -> Tensor:
     """Decode residuals [N, 3] (green, red - green, blue - green) to float32 RGB."""
-    g, r, b = np.ascontiguousarray(residual.T)
-    values = np.stack([r + g, g, b + g], axis=1) * step
+    values = from_differences(residual) * step
     return torch.from_numpy(np.clip(values, -RESIDUAL_LIMIT, RESIDUAL_LIMIT).astype(np.float32))
 
 
 def residual_codes(values: Tensor) -> npt.NDArray[np.int64]:
     """Quantise residuals [N, 3]."""
-    r, g, b = np.rint(values.double().numpy() / RESIDUAL_STEP).astype(np.int64).T
-    return np.stack([g, r - g, b - g], axis=1)
+    return to_differences(quantised(values.double().numpy(), RESIDUAL_STEP))
 
 
 @dataclass(frozen=True)
@@ -216,18 +201,18 @@ class SceneCodes:
 class TexelCoder:
     """Texel coder of fixed tiles, weighted by their coverage in the views."""
 
-    def __init__(
-        self, sizes: Tensor, weights: Tensor, options: TexelCodeOptions, first: TexelCodes | None = None
-    ) -> None:
+    def __init__(self, sizes: Tensor, weights: Tensor, step: float = STEP, first: TexelCodes | None = None) -> None:
         """
         Args:
             sizes: [N, 2] sides of the tiles; (0, 0) = one constant.
             weights: [T] texel weights, in the order of `TexelTiles`: sum over views and fragments of the squared
                 blending weight times the bilinear weight. A texel error e adds weight times e^2 to the pictures.
+            step: of a coefficient, in 8-bit steps, for texels that cover one pixel of the views; step / sqrt(w) if they
+                cover w pixels.
             first: earlier codes, whose alphas and grades are kept; None: start afresh.
         """
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
-        self._step = options.step / 255
+        self._step = step / 255
         self.blocks = blocks_of(self._sizes)
         tiled = self._sizes[:, 0] > 0
         area = self._sizes.clamp(min=1).prod(dim=1)
@@ -337,7 +322,4 @@ def _steps(step: float, grades: Tensor) -> Tensor:
 @cache
 def _cosines(count: int) -> Tensor:
     """Compute the orthonormal cosine transform [count, count]; row k is frequency k."""
-    k, i = np.arange(count)[:, None], np.arange(count)[None]
-    rows = np.cos(math.pi * (i + 0.5) * k / count) * math.sqrt(2.0 / count)
-    rows[0] /= math.sqrt(2.0)
-    return torch.from_numpy(rows.astype(np.float32))
+    return torch.from_numpy(dct(np.eye(count), axis=0, norm="ortho").astype(np.float32))

@@ -22,7 +22,6 @@ from bitymi_ns.bake.compact import (
 )
 from bitymi_ns.bake.precision import PER_BIT
 from bitymi_ns.bundle import check_files
-from bitymi_ns.codec.texel_codes import TexelCodeOptions
 from bitymi_ns.train.views import View
 from tests.bake.test_tune import BACKGROUND, photographs, render, waving_reduced
 
@@ -74,10 +73,10 @@ def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
 def test_a_large_error_of_the_bake_does_not_hide_that_of_rounding(truth: Reduced, views: list[View]) -> None:
     dark = [View(view.camera, view.image / 2) for view in views]
     capped = compacted(truth, dark, BACKGROUND, Compact(share=0.9))
-    assert capped.coding.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MAX_LAMBDA / PER_BIT))
-    assert capped.coding.step == pytest.approx(4.16, abs=0.02)
+    assert capped.step == pytest.approx(255 * math.sqrt(TEXEL_SHARE * 12 * MAX_LAMBDA / PER_BIT))
+    assert capped.step == pytest.approx(4.16, abs=0.02)
     asked = compacted(truth, dark, BACKGROUND, Compact(psnr=Coder(truth, dark, BACKGROUND, Compact()).psnr - 2))
-    assert asked.coding.step > capped.coding.step and asked.codes.nbytes() < capped.codes.nbytes()
+    assert asked.step > capped.step and asked.codes.nbytes() < capped.codes.nbytes()
 
 
 def test_the_pictures_are_as_good_as_is_asked_for(truth: Reduced, views: list[View]) -> None:
@@ -96,10 +95,10 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Reduced, views: 
     free = compacted(truth, views, BACKGROUND, Compact(share=0.02))
     most = (free.codes.nbytes() + free.encoded().codes.texels.nbytes()) * 7 // 10
     fitted = compacted(truth, views, BACKGROUND, Compact(most_bytes=most))
-    assert fitted.coding.fill and fitted.codes.nbytes() < free.codes.nbytes()
+    assert fitted.fill and fitted.codes.nbytes() < free.codes.nbytes()
     for fill in (True, False):
         options = TuneOptions(steps=0, coded_steps=60, val_every=0)
-        again = replace(fitted, coding=replace(fitted.coding, fill=fill))
+        again = replace(fitted, fill=fill)
         tuned = tune_atlas(again, views, BACKGROUND, options)
         export(tuned, bundle := tmp_path / f"fill-{fill}")
         size = sum((bundle / name).stat().st_size for name in ("surfels.bin", "texels.bin"))
@@ -125,7 +124,7 @@ def test_bytes_that_buy_nothing_are_not_spent(truth: Reduced, views: list[View])
     assert kept.statistics.rounding.mse <= 1.001 * ENOUGH * coder.error
     size = kept.codes.nbytes() + kept.encoded().codes.texels.nbytes()
     assert size < 0.8 * coder.at(START / 1000).bytes
-    assert kept.coding.most_bytes == 10**9 - kept.codes.nbytes()
+    assert kept.most_bytes == 10**9 - kept.codes.nbytes()
 
 
 def test_without_views_the_reference_steps_are_taken(truth: Reduced) -> None:
@@ -138,7 +137,7 @@ def test_texels_learn_through_their_coding_and_are_what_is_stored(
     rounded: Rounded, views: list[View], tmp_path
 ) -> None:
     options = TuneOptions(steps=8, coded_steps=40, coded_every=5, val_every=4)
-    coarse = replace(rounded, coding=TexelCodeOptions(step=30.0))
+    coarse = replace(rounded, step=30.0)
     still = tune_atlas(coarse, views, BACKGROUND, replace(options, coded_steps=0))
     tuned = tune_atlas(coarse, views, BACKGROUND, options)
 

@@ -14,7 +14,7 @@ from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.codec.quantise import Range, encode
 from bitymi_ns.codec.surfel_codes import REFERENCE, code_surfels
-from bitymi_ns.codec.texel_codes import SceneCodes, TexelCodeOptions, TexelCoder, mean_alphas_of
+from bitymi_ns.codec.texel_codes import SceneCodes, TexelCoder, mean_alphas_of
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
@@ -44,7 +44,7 @@ def make_codes(
     sizes = sizes[order]
     generator = torch.Generator().manual_seed(0)
     texels = torch.rand(int(sizes.clamp(min=1).prod(1).sum()), 3, generator=generator) - 0.5
-    coder = TexelCoder(sizes, torch.ones(len(texels)), TexelCodeOptions())
+    coder = TexelCoder(sizes, torch.ones(len(texels)))
     if alpha:
         coder.code_alpha(2 * torch.rand(len(texels), generator=generator))
     coded = coder.code(texels)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from bitymi_ns.codec import texel_codes as module
-from bitymi_ns.codec.texel_codes import Blocks, TexelCodeOptions, TexelCoder, blocks_of
+from bitymi_ns.codec.texel_codes import Blocks, TexelCoder, blocks_of
 from bitymi_ns.ops import backend
 
 SIZES = [[0, 0], [4, 4], [8, 16], [0, 0], [32, 8], [2, 1], [1, 8], [64, 64], [4, 2]]
@@ -94,7 +94,7 @@ def test_extreme_weights_and_steps_give_finite_coefficients():
     texels = torch.full((128, 3), 40.0)
     texels[::3] = -40.0
     for step in (0.01, 1000.0):
-        coder = TexelCoder(sizes, weights, TexelCodeOptions(step=step))
+        coder = TexelCoder(sizes, weights, step)
         found = coder.code(texels)
         assert np.isfinite(found.texels().numpy()).all()
     assert (found.texels() - texels).abs().mean() < 60

@@ -239,22 +239,22 @@ class Extras:
     overwrite: Flag = False  # Replace an existing folder of extras.
 
     def run(self) -> None:
-        from bitymi_ns import interchange
         from bitymi_ns.bundle import read_bundle
+        from bitymi_ns.interchange import extras
         from bitymi_ns.progress import rich_progress
 
-        output = self.output or interchange.extras_folder(self.bundle)
+        output = self.output or extras.extras_folder(self.bundle)
         bundle = read_bundle(self.bundle, crop=self.crop)
-        cameras = interchange.training_cameras(bundle)
-        removed = interchange.removal_line(self.kinds, output)
+        cameras = extras.training_cameras(bundle)
+        removed = extras.removal_line(self.kinds, output)
         with rich_progress() as progress:
             how = {"frame": self.frame, "cameras": cameras, "overwrite": self.overwrite, "progress": progress}
-            written = interchange.write_extras(bundle, output, self.kinds, **how)
+            written = extras.write_extras(bundle, output, self.kinds, **how)
         say(f"Wrote {output}" + (bundle.hidden and f"; {bundle.hidden}"))
         if removed:
             say(removed)
         for each in written.values():
-            say(interchange.summary_line(each))
+            say(extras.summary_line(each))
         if not cameras:
             say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
 

@@ -6,7 +6,6 @@ from bitymi_ns.bake.prune import prune_and_resample
 from bitymi_ns.bake.stages import Coded, Reduced, Rounded, Stage, Trained, export
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.progress import rich_progress
 
 __all__ = [
     "BakeOptions",
@@ -23,6 +22,5 @@ __all__ = [
     "export",
     "polish_scene",
     "prune_and_resample",
-    "rich_progress",
     "tune_atlas",
 ]

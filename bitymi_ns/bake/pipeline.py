@@ -164,9 +164,7 @@ def bake_field(
     scene: BakeableScene,
     cameras: Sequence[Camera] = (),
     options: BakeOptions | None = None,
-    progress: Progress | None = None,
+    progress: Progress = no_progress,
 ) -> Coded:
     """Bake a scene as it is, without photographs."""
-    options, progress = options or BakeOptions(), progress or no_progress
-    options.check()
-    return bake(scene, cameras, (), torch.zeros(3), options, RefineOptions(), progress)
+    return bake(scene, cameras, (), torch.zeros(3), options or BakeOptions(), RefineOptions(), progress)

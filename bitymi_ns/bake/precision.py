@@ -55,14 +55,12 @@ class Pictures:
     def square(self, pictures: Sequence[Tensor], than: Sequence[Tensor] | None = None) -> float:
         """Average the square difference from other pictures; None: from the photographs."""
         pairs = zip(pictures, self._targets if than is None else than, self._masks, strict=True)
-        squares = [_square(*pair) for pair in pairs]
-        return sum(squares) / max(1, len(squares))
+        return sum(_square(*pair) for pair in pairs) / max(1, self.views)
 
     def psnr(self, pictures: Sequence[Tensor]) -> float:
-        """Average the PSNR, dB, over views with an unmasked pixel, against the photographs."""
+        """Average the PSNR, dB, against the photographs."""
         pairs = zip(pictures, self._targets, self._masks, strict=True)
-        found = [psnr(a, b, m) for a, b, m in pairs if m is None or bool(m.any())]
-        return sum(found) / max(1, len(found))
+        return sum(psnr(*pair) for pair in pairs) / max(1, self.views)
 
 
 def _counts(view: View) -> bool:
@@ -130,6 +128,4 @@ def _step(name: str, error: float, noise: float) -> float:
 
 def _square(rgb: Tensor, target: Tensor, mask: Tensor | None) -> float:
     difference = (rgb.clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).square()
-    if mask is None:
-        return float(difference.mean())
-    return float(difference[mask.reshape(mask.shape[:2])].mean()) if bool(mask.any()) else 0.0
+    return float((difference if mask is None else difference[mask.reshape(mask.shape[:2])]).mean())

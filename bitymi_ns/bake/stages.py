@@ -155,10 +155,12 @@ class Reduced(Stage):
         """Encode the texels in pages."""
         if not self.textured:
             return _coded(self, tile_means(self.texels, self.sizes))
-        return self.coded(encoded_texels(self.texels, self.packing, self.options, progress), self.texels)
+        atlas = encoded_texels(self.texels, self.packing, self.options, progress)
+        return self.coded(atlas, self.texels[:, :3])
 
-    def coded(self, atlas: EncodedAtlas, texels: Tensor) -> Coded:
-        """Store texels [T, C] in pages that were encoded from them."""
+    def coded(self, atlas: EncodedAtlas, colors: Tensor) -> Coded:
+        """Store residual colours [T, 3] in pages that were encoded from them."""
+        texels = self.with_alpha(colors)
         return _coded(replace(self, texels=texels), tile_means(texels, self.sizes), (atlas, atlas.pages()))
 
 

@@ -19,11 +19,6 @@ from bitymi_ns.train.init import tangents
 _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is evaluated
 
 
-def seen_rms(difference: Tensor, weight: Tensor, cells: Tensor) -> Tensor:
-    """Compute `weighted_rms` as a view shows it: difference x weight, averaged over a pixel's `cells` [n, 2] first."""
-    return weighted_rms(moving_average(difference * weight[:, None], cells), (weight > 0).float())
-
-
 @torch.no_grad()
 def listed_errors(
     difference: Tensor, sizes: Tensor, shown: TileVisibility, chunk: int = 1 << 18
@@ -47,7 +42,8 @@ def listed_errors(
     )
     for size, rows, index in chain(listed_tiles(sizes, chunk), constants):
         weight = weights(shown, rows, size)
-        errors[rows] = seen_rms(difference[index].permute(0, 3, 1, 2), weight, cells_per_pixel(shown, rows, size))
+        away = difference[index].permute(0, 3, 1, 2) * weight[:, None]
+        errors[rows] = weighted_rms(moving_average(away, cells_per_pixel(shown, rows, size)), (weight > 0).float())
         seen[rows] = (weight > 0).flatten(1).any(1)
     return errors, seen
 

@@ -76,10 +76,6 @@ class Cosines:
             return best
         return self._coded(best.listed, self._coder.fit(best.texels, self._most, rounds=1))
 
-    def result(self, last: StoredTexels[TexelCodes]) -> Coded:
-        """Go on to the stage with these texels."""
-        return self._baked.coded(last.stored, last.listed)
-
     def _coded(self, texels: Tensor, codes: TexelCodes) -> StoredTexels[TexelCodes]:
         return StoredTexels(texels.clone(), codes.texels_of(self._coder.blocks), codes)
 
@@ -108,10 +104,6 @@ class Pages:
     def last(self, best: StoredTexels[EncodedAtlas]) -> StoredTexels[EncodedAtlas]:
         """Return the best atlas as it is, see `Cosines.last`."""
         return best
-
-    def result(self, last: StoredTexels[EncodedAtlas]) -> Coded:
-        """Go on to the stage with these texels."""
-        return self._baked.coded(last.stored, self._baked.with_alpha(last.listed))
 
 
 @dataclass
@@ -194,7 +186,14 @@ def tune_atlas(
     else:
         covered, coder = texels.coverage(trained, progress), Pages(baked)
     share = 1.0 / (covered[:, 0] + options.prior)  # [T]
-    _descend(texels.values.clone(), tuned, validation, share, stopping, options, progress)
+    moved = texels.values.clone()
+    for step in range(options.steps):
+        view, rate = training_order(len(tuned), options.seed, step), falling(options.rate, step, options.steps)
+        tuned.step(view, moved, share, rate, options.ssim_weight)
+        progress("tuning texels", step + 1, options.steps)
+        if stopping.due(step + 1) and not stopping.update(step + 1, validation.psnr(moved), moved.clone):
+            progress("tuning texels", step + 1, step + 1)  # completes the bar
+            break
     held_out = TuningViews(texels, eval_views, background, MemoryBudget(0))
     untuned = held_out.psnr(coder.first(texels.values.cpu()).texels) if eval_views else None
     coded = _coded(tuned, validation, share, stopping.best, coder, options, progress)
@@ -204,26 +203,7 @@ def tune_atlas(
         steps_asked=options.steps + options.coded_steps,
         psnr_held_out=None if untuned is None else gain(untuned, held_out.psnr(coded.texels)),
     )
-    return coder.result(coded).stating(finetune=statistics)
-
-
-def _descend(
-    texels: Tensor,
-    views: TuningViews,
-    validation: TuningViews,
-    share: Tensor,
-    stopping: EarlyStopping[Tensor],
-    options: TuneOptions,
-    progress: Progress,
-) -> None:
-    """Run the steps on texels [T, 3] in place, with step sizes `share` [T], and evaluate the validation views."""
-    for step in range(options.steps):
-        rate = falling(options.rate, step, options.steps)
-        views.step(training_order(len(views), options.seed, step), texels, share, rate, options.ssim_weight)
-        progress("tuning texels", step + 1, options.steps)
-        if stopping.due(step + 1) and not stopping.update(step + 1, validation.psnr(texels), texels.clone):
-            progress("tuning texels", step + 1, step + 1)  # completes the bar
-            break
+    return baked.coded(coded.stored, coded.listed).stating(finetune=statistics)
 
 
 def _coded(
@@ -243,10 +223,8 @@ def _coded(
     stopping = EarlyStopping(max(1, options.coded_steps), options.checks, options.patience, psnr, coded)
     shift = torch.zeros_like(texels)
     for step in range(options.coded_steps):
-        rate, view = (
-            falling(options.coded_rate, step, options.coded_steps),
-            training_order(len(views), options.seed, step),
-        )
+        view = training_order(len(views), options.seed, step)
+        rate = falling(options.coded_rate, step, options.coded_steps)
         views.step(view, texels, share, rate, options.ssim_weight, texels + shift)
         progress("tuning texels as they are stored", step + 1, options.coded_steps)
         last = step + 1 == options.coded_steps

@@ -1,6 +1,6 @@
 """Fine-tuning of a bake's texels on the photographs: the list of texels, and views traced once and cached."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -121,7 +121,10 @@ class TuningViews(Sequence[TuningView]):
         p, camera = scene.surfels, projection.camera
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)
         lists, rest, alpha = [], [], []
-        for plain, chosen in self._chosen(projection, base):
+        for fragments in fitting_lists(projection):
+            plain = blended_image(fragments, projection, base)
+            chosen = select(fragments, fragments.weight >= scene.weight_bound)
+            del fragments  # before the next list is made
             alpha.append(plain[:, 3:4])
             rest.append(plain[:, :3] - blended_image(chosen, projection, base)[:, :3])
             lists.append(chosen)
@@ -139,14 +142,6 @@ class TuningViews(Sequence[TuningView]):
             None if view.correction is None else view.correction.detach().to(device),
             None if view.correction is None else covered.reshape(*size, 1),
         )
-
-    def _chosen(self, projection: Projection, base: Tensor) -> Iterator[tuple[Tensor, Fragments]]:
-        """Yield, per band, the image [h * W, 5] of all fragments, and the fragments that show a texel."""
-        for fragments in fitting_lists(projection):
-            image = blended_image(fragments, projection, base)
-            chosen = select(fragments, fragments.weight >= self._texels.scene.weight_bound)
-            del fragments  # before the next list is made
-            yield image, chosen
 
     def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
         """Render a view with texels, and apply its photograph's correction: [H, W, 3]. `view`: of this sequence.

@@ -10,6 +10,7 @@ Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms (nu
 surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
 """
 
+import re
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -190,7 +191,7 @@ def from_columns(
 def _full_from_columns(columns: Mapping[str, npt.NDArray], kind: str, count: int) -> dict[str, Tensor]:
     entry, surfels = VIEW_COLORS[kind], {}
     for name, shape, width in ((p.name, p.shape, p.width) for p in entry.parameters):
-        found = [int(column[len(name) + 1 :]) for column in columns if _is_number_of(column, name)]
+        found = [int(match[1]) for match in map(re.compile(rf"{name}_([0-9]{{1,5}})").fullmatch, columns) if match]
         if sorted(found) != list(range(len(found))) or len(found) % width or (-1 not in shape and len(found) != width):
             raise PlyError(f"the view colour needs {name}_0.. in groups of {width}, not {len(found)} columns")
         values = _stack(columns, _numbered(name, len(found))) if found else torch.zeros(count, 0, dtype=torch.float32)
@@ -236,8 +237,3 @@ def _stack(columns: Mapping[str, npt.NDArray], names: tuple[str, ...], dtype: ty
 
 def _numbered(name: str, count: int) -> tuple[str, ...]:
     return tuple(f"{name}_{i}" for i in range(count))
-
-
-def _is_number_of(column: str, name: str) -> bool:
-    rest = column[len(name) + 1 :]
-    return column.startswith(f"{name}_") and rest.isascii() and rest.isdecimal() and len(rest) < 6

@@ -137,21 +137,18 @@ def write_extras(
     def write(kind: Kind, path: Path) -> int:
         """Write a file; returns its number of Gaussians or quads."""
         if kind == "mesh":
-            return write_mesh(path)
+            quads = quads_of(scene, colors.color, LEVEL)
+            if not len(quads):
+                raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
+            chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
+            quads = recolored(quads, lambda camera: scene.render(camera, background).rgb, chosen, scene.near, progress)
+            path.write_bytes(quads_glb(quads if to is None else quads.moved(to), place))
+            return len(quads)
         if kind == "usd":
             write_usd(path, gaussians(), place)
         else:
             write_gaussians(path, gaussians(), [note] if note else [], flat=kind == "surfels")
         return len(gaussians())
-
-    def write_mesh(path: Path) -> int:
-        quads = quads_of(scene, colors.color, LEVEL)
-        if not len(quads):
-            raise BundleError(f"no surfel of the bundle has an opacity above {LEVEL}: there is no mesh")
-        chosen = [cameras[i].within(COLORED_SIDE) for i in spread(len(cameras), COLORED_VIEWS)]
-        quads = recolored(quads, lambda camera: scene.render(camera, background).rgb, chosen, scene.near, progress)
-        path.write_bytes(quads_glb(quads if to is None else quads.moved(to), place))
-        return len(quads)
 
     written: dict[str, ExtraFile] = {}
     replaceable = partial(check_extras, kinds, folder, overwrite)

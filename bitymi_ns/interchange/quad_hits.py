@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.interchange.quads import MASK, Quads
+from bitymi_ns.interchange.quads import MASK, Quads, bilinear
 from bitymi_ns.scene.camera import Camera
 
 _AT_ONCE = 1 << 19  # pairs of quads and pixels per batch
@@ -97,14 +97,6 @@ def _fetch(pages: Tensor, page: Tensor, uv: Tensor) -> Tensor:
     size = torch.tensor([pages.shape[2], pages.shape[1]])
     at = uv * size - 0.5
     low = at.floor()
-    f = (at - low).float()
-    low = low.long()
-    low, high = (torch.minimum(c.clamp(min=0), size - 1) for c in (low, low + 1))
-
-    def texel(x: Tensor, y: Tensor) -> Tensor:
-        return pages[page, y, x].float() / 255.0
-
-    fu, fv = f[:, :1], f[:, 1:]
-    top = texel(low[:, 0], low[:, 1]) * (1 - fu) + texel(high[:, 0], low[:, 1]) * fu
-    bottom = texel(low[:, 0], high[:, 1]) * (1 - fu) + texel(high[:, 0], high[:, 1]) * fu
-    return top * (1 - fv) + bottom * fv
+    share = (at - low).float()
+    low, high = (torch.minimum(c.clamp(min=0), size - 1) for c in (low.long(), low.long() + 1))
+    return bilinear(lambda x, y: pages[page, y, x].float() / 255.0, low.unbind(1), high.unbind(1), share.split(1, 1))

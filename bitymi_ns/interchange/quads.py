@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -101,9 +102,16 @@ def fetch_texels(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tens
     def fetch(x: Tensor, y: Tensor) -> Tensor:
         return texels[(layer + y[:, :, None]) * width + x[:, None]].float() / unit * scale + offset
 
-    fu, fv = fu[:, None, :, None], fv[:, :, None, None]
-    top = fetch(low_u, low_v) * (1 - fu) + fetch(high_u, low_v) * fu
-    bottom = fetch(low_u, high_v) * (1 - fu) + fetch(high_u, high_v) * fu
+    return bilinear(fetch, (low_u, low_v), (high_u, high_v), (fu[:, None, :, None], fv[:, :, None, None]))
+
+
+def bilinear(
+    fetch: Callable[[Tensor, Tensor], Tensor], low: Sequence[Tensor], high: Sequence[Tensor], share: Sequence[Tensor]
+) -> Tensor:
+    """Interpolate what `fetch` returns for x, y between `low` and `high`, by the shares of the high ones."""
+    (x, y), (next_x, next_y), (fu, fv) = low, high, share
+    top = fetch(x, y) * (1 - fu) + fetch(next_x, y) * fu
+    bottom = fetch(x, next_y) * (1 - fu) + fetch(next_x, next_y) * fu
     return top * (1 - fv) + bottom * fv
 
 

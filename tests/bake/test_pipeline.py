@@ -12,10 +12,10 @@ from bitymi_ns.bake import (
     bake,
     bake_field,
     export,
-    rich_progress,
 )
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import read_bundle
+from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene import Camera
 from bitymi_ns.train.init import tangents
 from bitymi_ns.train.views import View

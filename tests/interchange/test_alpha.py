@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle import Bundle
-from bitymi_ns.interchange import write_extras
+from bitymi_ns.interchange.extras import write_extras
 from bitymi_ns.interchange.gaussians import Gaussians, gaussians_of
 from bitymi_ns.interchange.quad_hits import nearest_hits
 from bitymi_ns.interchange.quads import Quads, quads_of

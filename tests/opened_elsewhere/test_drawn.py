@@ -16,7 +16,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.interchange import extras, write_extras
+from bitymi_ns.interchange import extras
+from bitymi_ns.interchange.extras import write_extras
 from bitymi_ns.interchange.gaussians import Gaussians, write_gaussians
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import psnr

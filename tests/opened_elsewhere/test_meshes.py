@@ -10,7 +10,7 @@ import torch
 import trimesh
 
 from bitymi_ns.bundle import Bundle
-from bitymi_ns.interchange import write_extras
+from bitymi_ns.interchange.extras import write_extras
 from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes
 from bitymi_ns.interchange.triangles import Triangles
 from tests.opened_elsewhere.node import said_by

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from bitymi_ns.bundle import Bundle, BundleError
-from bitymi_ns.interchange import extras, write_extras
+from bitymi_ns.interchange import extras
+from bitymi_ns.interchange.extras import write_extras
 from bitymi_ns.interchange.gaussians import HARD_BETA
 from bitymi_ns.interchange.usd import write_usd
 from bitymi_ns.ops.constants import BETA_MAX

@@ -9,14 +9,14 @@ from pathlib import Path
 import tyro
 
 from bitymi_ns import exit_messages
-from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export, rich_progress
+from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
 from bitymi_ns.bundle import BundleError, reserved_bundle
 from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.parts import CONFIG
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.interchange import (
+from bitymi_ns.interchange.extras import (
     Frame,
     Kind,
     extras_folder,
@@ -31,6 +31,7 @@ from bitymi_ns.plugin.export.summary import print_summary
 from bitymi_ns.plugin.export.target import bundle_config, bundle_version, check_room
 from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.memory import state_export
+from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 

@@ -17,7 +17,7 @@ from bitymi_ns.bundle.strict_json import plain
 from bitymi_ns.bundle.world import WorldEntry
 from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import reserved, size_text, write_errors_as, write_file
-from bitymi_ns.interchange import Frame, training_cameras
+from bitymi_ns.interchange.extras import Frame, training_cameras
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
 from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes

@@ -33,9 +33,8 @@ from bitymi_ns.trust import listed
 @torch.no_grad()
 def trained_texels(scene: BakeableScene, options: BakeOptions) -> Trained:
     """Bake a scene whose texels were trained: all of its tiles, view colours and drawable surfels; `prune_and_resample`
-    then drops what the options say. Without texels no surfel has a tile. Raises ValueError: no surfel is left, an
-    option is out of range, or the atlas would be too large."""
-    options.check()
+    then drops what the options say. Without texels no surfel has a tile. Raises ValueError: no surfel is left, or the
+    atlas would be too large."""
     rows, left_out = drawable(scene.surfels)
     trained = len(scene.surfels["means"])
     if len(rows) == 0:
@@ -139,6 +138,7 @@ def bake(
     Raises:
         ValueError: no surfel is left, an option is out of range or for a field alone, or the atlas would be too large.
     """
+    options.check()
     of_fields = ("r_min", "r_max", "extent", "local_voxel")
     given = [name for name in of_fields if getattr(options, name) != getattr(BakeOptions, name)]
     if given and isinstance(scene.field, TexelField):

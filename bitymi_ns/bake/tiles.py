@@ -116,12 +116,6 @@ def fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
     return along_axes(values, fit(u, size[0]).to(values), fit(v, size[1]).to(values))
 
 
-def read_at(texels: Tensor, size: tuple[int, int]) -> Tensor:
-    """Interpolate tiles [n, C, v, u] on a finer grid (u, v)."""
-    u, v = texels.shape[3], texels.shape[2]
-    return along_axes(texels, interpolation(size[0], u).to(texels), interpolation(size[1], v).to(texels))
-
-
 @torch.no_grad()
 def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress) -> Tiles:
     """Resample every tile to the smallest grid within the tolerance; drop the tile where one colour is within it.
@@ -187,7 +181,8 @@ def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list
         promising = open_ & (along_u[size[0]] + along_v[size[1]] <= (_FORESIGHT * tolerance) ** 2)
         at = torch.nonzero(promising).squeeze(1)
         if size != limits and len(at):
-            rebuilt = read_at(fitted(values[at], size), limits)
+            finer = (interpolation(limit, side).to(values) for limit, side in zip(limits, size, strict=True))
+            rebuilt = along_axes(fitted(values[at], size), *finer)
             at = at[weighted_rms(rebuilt - values[at], weight[at]) <= tolerance]
         if len(at):
             open_[at] = False

@@ -173,22 +173,23 @@ def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
     return packing
 
 
-def check_surfels_size(info: Surfels, size: int) -> None:
-    """Check the size of surfels.bin against bundle.json before reading. Raises StreamError: they differ."""
-    _check_size(info.columns or [], size)
-    if max(info.count, info.terms or 0) > SURFELS_PER_BYTE * size + SPARE_SURFELS:
-        raise StreamError(f"{info.count} surfels with {info.terms} terms cannot be in {size} bytes")
-
-
-def check_texels_size(info: AtlasEntry, size: int, surfels: int) -> None:
-    """Check the size of texels.bin against bundle.json before reading; surfels.bin has `surfels` bytes. Raises
-    StreamError: they differ."""
-    _check_size(info.columns or [], size)
-    if (
-        max(info.texels or 0, info.width * info.height * info.layers)
-        > TEXELS_PER_BYTE * (size + surfels) + SPARE_TEXELS
-    ):
-        raise StreamError(f"{info.texels} texels cannot be in {size} bytes, and {surfels} of {COMPACT_SURFELS}")
+def check_size(info: Manifest, name: str, size: int) -> None:
+    """Check the size of surfels.bin or texels.bin against bundle.json before reading. Raises StreamError: they differ."""
+    surfels, atlas = info.surfels, info.atlas
+    entry = surfels if name == COMPACT_SURFELS else atlas
+    stated = sum(sum(column.bytes) for column in (entry and entry.columns) or ())
+    if stated != size:
+        raise StreamError(f"truncated or too long: the columns need {stated} bytes, the file has {size}")
+    if name == COMPACT_SURFELS:
+        if max(surfels.count, surfels.terms or 0) > SURFELS_PER_BYTE * size + SPARE_SURFELS:
+            raise StreamError(f"{surfels.count} surfels with {surfels.terms} terms cannot be in {size} bytes")
+    elif atlas is not None:
+        beside, texels = (
+            info.files[COMPACT_SURFELS].bytes,
+            max(atlas.texels or 0, atlas.width * atlas.height * atlas.layers),
+        )
+        if texels > TEXELS_PER_BYTE * (size + beside) + SPARE_TEXELS:
+            raise StreamError(f"{atlas.texels} texels cannot be in {size} bytes, and {beside} of {COMPACT_SURFELS}")
 
 
 def _check_columns(
@@ -236,9 +237,3 @@ def _parts(data: memoryview, columns: Sequence[ColumnEntry]) -> Iterator[memoryv
         size = sum(column.bytes)
         yield data[at : at + size]
         at += size
-
-
-def _check_size(columns: Sequence[ColumnEntry], size: int) -> None:
-    stated = sum(sum(column.bytes) for column in columns)
-    if stated != size:
-        raise StreamError(f"truncated or too long: the columns need {stated} bytes, the file has {size}")

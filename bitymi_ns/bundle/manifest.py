@@ -288,7 +288,7 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
         stated = info.pop("digest", None)
         _check_version(info, source)
         text = strict_json.canonical(info)
-        found = strict_json.digest_of(text)
+        found = strict_json.digest(info)
     except BundleError:
         raise
     except ValueError as error:

@@ -36,10 +36,8 @@ def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
         found = (header.format, header.width, header.height, header.layers)
         if atlas is None or found != (atlas.format, atlas.width, atlas.height, atlas.layers):
             raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
-    elif name == COMPACT_SURFELS:
-        compact.check_surfels_size(surfels, size)
-    elif name == TEXELS and atlas is not None:
-        compact.check_texels_size(atlas, size, info.files[COMPACT_SURFELS].bytes)
+    elif name == COMPACT_SURFELS or (name == TEXELS and atlas is not None):
+        compact.check_size(info, name, size)
 
 
 @contextmanager

@@ -32,12 +32,7 @@ def canonical(value: Any) -> bytes:
 
 def digest(value: Any) -> str:
     """Compute the SHA-256 of `canonical(value)`, 64 hexadecimal digits."""
-    return digest_of(canonical(value))
-
-
-def digest_of(text: bytes) -> str:
-    """Compute the digest of a value from its canonical text."""
-    return hashlib.sha256(text).hexdigest()
+    return hashlib.sha256(canonical(value)).hexdigest()
 
 
 def plain(value: Any) -> Any:

@@ -58,24 +58,16 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
     except BundleError as error:
         return None, [*checks, Check("contents", False, str(error))]
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))
-    checks += [*_check_decoder(info, files), _tiles(bundle), _check_counts(bundle), *check_certificate(bundle)]
-    return bundle, [*checks, *_check_notes(parts)]
-
-
-def _check_decoder(info: Manifest, files: dict[str, bytearray]) -> list[Check]:
-    """Compare the integers of a compact bundle, as decoded here, with those that were written."""
-    if info.decoded is None:
-        return []
-    same = compact.decoded_hash(info, files) == info.decoded
-    return [Check("decoder", same, "the integers are " + ("those" if same else "not those") + " that were written")]
-
-
-def _check_notes(parts: Parts) -> list[Check]:
+    if info.decoded is not None:  # the integers of a compact bundle, as decoded here
+        same = compact.decoded_hash(info, files) == info.decoded
+        checks.append(Check("decoder", same, f"the integers are {'those' if same else 'not those'} that were written"))
+    checks += [_tiles(bundle), _check_counts(bundle), *check_certificate(bundle)]
     try:
-        found = read_notes(parts)
+        notes = read_notes(parts)
+        checks += [] if notes is None else [Check(NOTES, True, notes[1].contents)]
     except BundleError as error:
-        return [Check(NOTES, False, str(error))]
-    return [] if found is None else [Check(NOTES, True, found[1].contents)]
+        checks.append(Check(NOTES, False, str(error)))
+    return bundle, checks
 
 
 def _format_world(frame: WorldEntry) -> str:

@@ -18,11 +18,10 @@ from bitymi_ns.interchange.gaussians import Gaussians, gaussians_of, write_gauss
 from bitymi_ns.interchange.glb import quads_glb, upright
 from bitymi_ns.interchange.quads import quads_of
 from bitymi_ns.interchange.recolor import recolored
-from bitymi_ns.interchange.surfel_colors import SurfelColors, fit_colors, weighted_residuals
+from bitymi_ns.interchange.surfel_colors import fit_colors, weighted_residuals
 from bitymi_ns.interchange.usd import check_usd, write_usd
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import spread
-from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.trust import check_replaceable
@@ -126,7 +125,9 @@ def write_extras(
     to = to_capture(bundle.info.world) if frame == "capture" else None
     note = to.note if to is not None else ""
     scene, background = bundle.scene, torch.tensor(bundle.info.render.background)
-    colors = _fitted_colors(scene, cameras, progress)
+    drawn = ([camera.within(SEEN_SIDE) for camera in cameras], scene.near, scene.weight_bound, progress)
+    seen = visibility(scene.surfels, *drawn, texel_alpha(scene)).seen
+    colors = fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))
     place = upright(up_of(bundle.info.world, to), None if to is None else to.origin)
 
     @cache
@@ -166,10 +167,3 @@ def write_extras(
 def summary_line(written: ExtraFile) -> str:
     """Summarise a written file in one line."""
     return f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB" + (written.note and f"; {written.note}")
-
-
-def _fitted_colors(scene: BakedScene, cameras: Sequence[Camera], progress: Progress) -> SurfelColors:
-    chosen = [camera.within(SEEN_SIDE) for camera in cameras]
-    drawn = (scene.near, scene.weight_bound, progress, texel_alpha(scene))
-    seen = visibility(scene.surfels, chosen, *drawn).seen
-    return fit_colors(scene, weighted_residuals(scene), seen, centers_of(cameras, scene.surfels["means"]))

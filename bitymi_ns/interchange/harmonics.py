@@ -51,15 +51,11 @@ def _from_monomials() -> Tensor:
 
 def _of_kernel(directions: Tensor) -> Tensor:
     """Evaluate the compiled kernel for each harmonic in the directions, [D, 16] float64."""
-    count = len(directions)
-    columns = []
-    for term in range(TERMS):
-        coefficients = directions.new_zeros(count, TERMS, 3)
-        coefficients[:, term, 0] = 1.0
-        parts = coefficients[:, 0].contiguous(), coefficients[:, 1:].contiguous()
-        parameters = dict(zip(entry_of("sh").names, parts, strict=True))
-        columns.append(view_color("sh", parameters, directions, directions.new_zeros(3))[:, 0])
-    return torch.stack(columns, dim=1)
+    rows = directions.repeat_interleave(TERMS, 0)
+    coefficients = torch.eye(TERMS).to(rows).repeat(len(directions), 1)[..., None].expand(-1, -1, 3)
+    parts = coefficients[:, 0].contiguous(), coefficients[:, 1:].contiguous()
+    parameters = dict(zip(entry_of("sh").names, parts, strict=True))
+    return view_color("sh", parameters, rows, rows.new_zeros(3))[:, 0].view(-1, TERMS)
 
 
 _SAMPLES = 64

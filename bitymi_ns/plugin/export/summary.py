@@ -9,7 +9,7 @@ from rich.table import Table
 
 from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, Manifest
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.bundle.statistics import FineTuning, Percentiles
+from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.plugin.console import say
@@ -102,7 +102,7 @@ def print_view_color(table: Table, info: Manifest) -> None:
         table.add_row("View colour", "all of it is kept")
         table.add_row("Surfel bytes", f"{stored:,}")
         return
-    sites, count = lean.sites, info.surfels.count
+    sites, count, error = lean.sites, info.surfels.count, lean.error
     share = 100 * sites.after / sites.before
     table.add_row(VIEW_COLORS[lean.kind].kept, f"{sites.before:,} -> {sites.after:,} ({share:.1f} %)")
     table.add_row("Surfels of one colour", f"{lean.one_color:,} ({100 * lean.one_color / count:.1f} %)")
@@ -111,7 +111,9 @@ def print_view_color(table: Table, info: Manifest) -> None:
         table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
     else:
         table.add_row("Surfel bytes", f"{stored:,} ({stored / max(1, count):.1f} per surfel)")
-    table.add_row("Error of a view colour", percentiles_text(lean.error))
+    table.add_row(
+        "Error of a view colour", f"median {error.p50:.2f}, 99 % {error.p99:.2f}, at most {error.p100:.2f} steps"
+    )
     table.add_row("", f"(tolerance {lean.tolerance:g}; weighted, largest over directions and channels)")
 
 
@@ -127,7 +129,3 @@ def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:
     for views, gain in gains.items():
         if gain is not None:
             table.add_row(views, f"{gain.before:.2f} -> {gain.after:.2f} dB")
-
-
-def percentiles_text(error: Percentiles) -> str:
-    return f"median {error.p50:.2f}, 99 % {error.p99:.2f}, at most {error.p100:.2f} steps"

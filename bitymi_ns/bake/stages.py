@@ -153,10 +153,11 @@ class Reduced(Stage):
 
     def encoded(self, progress: Progress = no_progress) -> Coded:
         """Encode the texels in pages."""
+        means = tile_means(self.texels, self.sizes)
         if not self.textured:
-            return _coded(self, tile_means(self.texels, self.sizes))
+            return _coded(self, means)
         atlas = encoded_texels(self.texels, self.packing, self.options, progress)
-        return self.coded(atlas, self.texels[:, :3])
+        return _coded(self, means, (atlas, atlas.pages()))
 
     def coded(self, atlas: EncodedAtlas, colors: Tensor) -> Coded:
         """Store residual colours [T, 3] in pages that were encoded from them."""

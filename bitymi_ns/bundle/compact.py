@@ -174,7 +174,7 @@ def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
 
 
 def check_size(info: Manifest, name: str, size: int) -> None:
-    """Check the size of surfels.bin or texels.bin against bundle.json before reading. Raises StreamError: they differ."""
+    """Check the size of surfels.bin or texels.bin against bundle.json before reading. Raises StreamError."""
     surfels, atlas = info.surfels, info.atlas
     entry = surfels if name == COMPACT_SURFELS else atlas
     stated = sum(sum(column.bytes) for column in (entry and entry.columns) or ())
@@ -184,10 +184,8 @@ def check_size(info: Manifest, name: str, size: int) -> None:
         if max(surfels.count, surfels.terms or 0) > SURFELS_PER_BYTE * size + SPARE_SURFELS:
             raise StreamError(f"{surfels.count} surfels with {surfels.terms} terms cannot be in {size} bytes")
     elif atlas is not None:
-        beside, texels = (
-            info.files[COMPACT_SURFELS].bytes,
-            max(atlas.texels or 0, atlas.width * atlas.height * atlas.layers),
-        )
+        beside = info.files[COMPACT_SURFELS].bytes
+        texels = max(atlas.texels or 0, atlas.width * atlas.height * atlas.layers)
         if texels > TEXELS_PER_BYTE * (size + beside) + SPARE_TEXELS:
             raise StreamError(f"{atlas.texels} texels cannot be in {size} bytes, and {beside} of {COMPACT_SURFELS}")
 

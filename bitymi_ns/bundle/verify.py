@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle import compact
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError
 from bitymi_ns.bundle.notes import read_notes
 from bitymi_ns.bundle.parts import NOTES, Parts, parts_of
 from bitymi_ns.bundle.read import CONTENTS, Bundle, assemble, manifest_of, read_file

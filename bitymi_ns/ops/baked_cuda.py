@@ -323,10 +323,8 @@ def draw(
     to = empty_images(images, len(cameras), width, height, device)
     size = (n, len(cameras), width, height, "normal" in to)
     with scene.cache.workspaces(lambda: Workspace(device)).borrow() as workspace:
-        workspace.resize(*size)
-        frame(arrays, viewmats, Ks, background, to, workspace, photo_pixel=photo_pixel)
-        if n and not workspace.frame_fitted():
+        while True:  # a second time if the pairs did not fit
             workspace.resize(*size)
             frame(arrays, viewmats, Ks, background, to, workspace, photo_pixel=photo_pixel)
-            workspace.frame_fitted()  # waits: the next frame may use the memory on another stream
-    return to
+            if n == 0 or workspace.frame_fitted():  # waits: the next frame may use the memory on another stream
+                return to

@@ -37,6 +37,7 @@ PARTS = {
 """Parts of bundle.json that the page reads."""
 TYPES = {
     "EARLIER": "Record<string, string>",
+    "LATER": "readonly string[]",
     "LEAN_COUNTS": "Record<string, readonly number[] | null>",
     "LINEAR": "Record<string, { words: readonly number[]; limit: number } & Record<'least' | 'absent', number | null>>",
     "PLY": "Record<string, readonly [number, number | null]>",
@@ -147,6 +148,7 @@ def tables() -> str:
         },
         "COLUMNS": {k: n for k, n in surfel_codes.columns_of("sv", True).items() if not k.startswith("term_")},
         "STEPPED": [*surfel_codes.REFERENCE, "residual"],
+        "LATER": sorted(surfel_codes.LATER),
         "LINEAR": {
             column: {
                 "words": [at_word(p.name)[0] + i for i in range(p.width)],

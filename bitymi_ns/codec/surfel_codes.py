@@ -19,6 +19,8 @@ Codes = npt.NDArray[np.int64]
 POSITION_BITS = 17  # bits per axis of a position: three axes fit exactly into a float64
 LINEAR = {parameter.code or name: parameter for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.step}
 """Parameters whose numbers are coded one by one, by column."""
+LATER = {column for column, parameter in LINEAR.items() if parameter.absent is not None}
+"""Columns that bundles of earlier versions lack."""
 REFERENCE: dict[str, float] = {
     "place": 1.0 / 512,
     "rotation": 1.0 / 128,
@@ -36,14 +38,13 @@ CODED = {parameter.code: name for name, parameter in GEOMETRY_PARAMETERS.items()
 
 def columns_of(kind: str, has_alpha: bool, stated: Collection[str] | None = None) -> dict[str, int]:
     """Count the numbers per row of the columns of surfels.bin, in their order. `stated`: columns of a file, which may
-    lack what earlier versions do (`Parameter.absent`)."""
+    lack those of `LATER`."""
     colors, shapes = term_numbers(kind)
     numbers = {"place": 1, "largest": 1, "rotation": 3, **{column: p.width for column, p in LINEAR.items()}, "size": 1}
-    if stated is not None:
-        lacking = {column for column, p in LINEAR.items() if p.absent is not None}.difference(stated)
-        numbers = {column: count for column, count in numbers.items() if column not in lacking}
     numbers |= {"residual": 3, **({"alpha": 1} if has_alpha else {}), "view_base": 3, "extent": 1, "view_count": 1}
-    return numbers | {"term_shape": len(shapes), "term_color": len(colors)}
+    numbers |= {"term_shape": len(shapes), "term_color": len(colors)}
+    lacking = set() if stated is None else LATER.difference(stated)
+    return {column: count for column, count in numbers.items() if column not in lacking}
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ export const COLUMNS = {
   extent: 1, view_count: 1,
 } as const;
 export const STEPPED: readonly string[] = ['place', 'rotation', 'log_scales', 'opacity', 'beta', 'extent', 'view_base', 'term_shape', 'term_color', 'residual'];
+export const LATER: readonly string[] = [];
 export const LINEAR: Record<string, { words: readonly number[]; limit: number } & Record<'least' | 'absent', number | null>> = {
   log_scales: { words: [8, 9], limit: 104, least: null, absent: null },
   opacity: { words: [3], limit: 1e4, least: 0.00392156862745098, absent: null },

@@ -8,6 +8,7 @@ import {
   EXTENT,
   EXTENTS,
   KINDS,
+  LATER,
   LEAN_COUNTS,
   LEAN_WIDTH,
   LIMITS,
@@ -34,7 +35,7 @@ const sinh = (x: number): number => Math.sinh(within(x, BENT));
 function expected({ viewColor: kind, atlas, compact }: Manifest): [string, number][] {
   const stated = new Set(compact!.columns.map((column) => column.name));
   const lacking = (name: string): boolean =>
-    name === 'alpha' ? !atlas?.alphaScale : !stated.has(name) && typeof LINEAR[name]?.absent === 'number';
+    name === 'alpha' ? !atlas?.alphaScale : !stated.has(name) && LATER.includes(name);
   const shapes = SHAPES[kind].limits.length;
   const terms: [string, number][] = [
     ['term_shape', shapes],

@@ -15,24 +15,19 @@ template <class S> BT_HD Unit<S> view_direction(const S* mean, const double* cen
   return normalize(from_center(mean, center));
 }
 
-constexpr const char* kViewColorNames[] = {SphericalVoronoi::kName, SphericalHarmonics::kName, SphericalBeta::kName,
-                                           SphericalGaussians::kName};
-// Call f with the struct of a kind, an index into kViewColorNames, and return its result.
+// Call f with the struct of a kind, an index into the names of ViewColorKinds, and return its result.
 #if defined(__CUDACC__)
 #pragma nv_exec_check_disable  // f may be for host or device only
 #endif
-template <class F> BT_HD auto for_view_color(int kind, F&& f) {
-  switch (kind) {
-    case 0:
-      return f(SphericalVoronoi());
-    case 1:
-      return f(SphericalHarmonics());
-    case 2:
-      return f(SphericalBeta());
-    default:
-      return f(SphericalGaussians());
-  }
+template <class F, class Kind, class... Rest> BT_HD auto for_kind(int kind, F&& f, ViewColorList<Kind, Rest...>) {
+  if constexpr (sizeof...(Rest) > 0)
+    if (kind > 0) return for_kind(kind - 1, f, ViewColorList<Rest...>());
+  return f(Kind());
 }
+#if defined(__CUDACC__)
+#pragma nv_exec_check_disable
+#endif
+template <class F> BT_HD auto for_view_color(int kind, F&& f) { return for_kind(kind, f, ViewColorKinds()); }
 BT_HD ViewColorWidths view_color_widths(int kind, int K) {
   return for_view_color(kind, [=](auto view_color) { return view_color.widths(K); });
 }
@@ -45,7 +40,7 @@ template <class S> struct ViewColorArrays {
 
   template <class R>  // as in ops/arguments.h
   void fields(R& r, int64_t n) {
-    r.choice("kind", kind, kViewColorNames);
+    r.choice("kind", kind, ViewColorKinds::kNames);
     r.number("terms", terms);
     arrays(r, n, "a", "b", "c");
   }
@@ -84,7 +79,7 @@ template <class S> struct LeanColors {
   const int32_t* span;    // [n, 2]: first term, number of terms
 
   template <class R> void fields(R& r, int64_t n, int64_t& count) {
-    r.choice("kind", kind, kViewColorNames);
+    r.choice("kind", kind, ViewColorKinds::kNames);
     r.array("base", base, 3 * n);
     r.array("span", span, 2 * n);
     r.rows("lean", terms, count, lean_width(kind));

@@ -295,4 +295,10 @@ struct SphericalGaussians : StoredWhole<SphericalGaussians> {
   }
 };
 
+template <class... Kinds> struct ViewColorList {
+  static constexpr const char* kNames[] = {Kinds::kName...};
+};
+// All kinds; in Python, `ops.view_kinds.VIEW_COLORS` has an entry for each.
+using ViewColorKinds = ViewColorList<SphericalVoronoi, SphericalHarmonics, SphericalBeta, SphericalGaussians>;
+
 }  // namespace bt

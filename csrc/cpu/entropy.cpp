@@ -20,7 +20,6 @@ constexpr int kMostThresholds = 7;
 constexpr int kOrders = 3;  // kinds of contexts
 constexpr int kLevels = 8;  // of the magnitudes of a block's earlier coefficients
 constexpr int kOthers = 3;  // values of `others`
-constexpr int kMostContexts = (1 + kLevels) * kOthers;
 constexpr int kLevelBounds[kLevels - 1] = {3, 7, 13, 21, 32, 56, 96};  // of 16 times their running mean
 
 int bit_length(uint64_t x) { return x ? 64 - __builtin_clzll(x) : 0; }

@@ -17,14 +17,14 @@ from scenes import SplitCapture, load_capture
 from torch import Tensor
 from torch.nn.functional import normalize
 
+from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.constants import SH_C0
-from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.init import neighbour_distance, scene_extent
-from bitymi_ns.train.losses import photometric
+from bitymi_ns.train.losses import fitted_psnr, photometric, psnr
 from bitymi_ns.train.views import training_order
 
 RATES = {"means": 1.6e-4, "scales": 5e-3, "opacities": 5e-2, "quats": 1e-3, "sh0": 2.5e-3, "shN": 2.5e-3 / 20}
@@ -156,7 +156,9 @@ def row(
     for view in (view.to(device) for view in capture.held_out):
         image = make(view.camera)()
         rgb = image if image.is_floating_point() else image.view(torch.uint8)[..., :3] / 255
-        qualities.append(image_metrics(rgb, view.target(None, device), view.mask))
+        rgb, target = rgb.float().clamp(0.0, 1.0), view.target(None, device)
+        psnrs = {"psnr": psnr(rgb, target, view.mask), "fitted_psnr": fitted_psnr(rgb, target, view.mask)}
+        qualities.append(psnrs | {"ssim": float(ops.ssim(rgb, target))})
     good, every = means(qualities), max(1, len(capture.held_out) // CAMERAS)
     cameras = [view.camera.to(device) for view in capture.held_out[::every][:CAMERAS]]
     options = Options(device, 5, RUNS)

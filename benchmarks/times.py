@@ -303,8 +303,12 @@ def main() -> int:
     if command not in (*COMMANDS, *MODULES):
         print(__doc__)
         return 0 if command in ("-h", "--help") else 2
-    module = import_module(MODULES[command]) if command in MODULES else None
-    run, text = (module.main, module.__doc__) if module else (COMMANDS[command], cleandoc(COMMANDS[command].__doc__))
+    if command in MODULES:
+        module = import_module(MODULES[command])
+        run, text = module.main, module.__doc__
+    else:
+        run = COMMANDS[command]
+        text = cleandoc(run.__doc__ or "")
     return run(Arguments(text, f"times.py {command}"), words) or 0
 
 

@@ -120,8 +120,8 @@ class CellSpec:
     @property
     def source(self) -> Path:
         """Path in the work folder of the config.yml that is evaluated or exported."""
-        source = "train" if self.kind == "export" or self.bundle is None else "export"
-        return replace(self, kind=source).output / "config.yml"
+        baked = self.kind == "eval" and self.bundle is not None
+        return replace(self, kind="export" if baked else "train").output / "config.yml"
 
     @property
     def run(self) -> str:

@@ -183,7 +183,7 @@ def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, 
 
 
 class _Binary:
-    """Sequential reader of a binary file; fails if it has less or more than it states."""
+    """Sequential reader of a binary file; fails if it has less than it states."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.offset = read_bytes(path, MOST_MODEL), 0
@@ -204,60 +204,53 @@ class _Binary:
         self.skip(end + 1 - self.offset)
         return text
 
-    def end(self) -> None:
+    def rows(self) -> Iterator["_Binary"]:
+        """Yield itself at the start of every row; fails if there is more behind the last one."""
+        for _ in range(self.take("Q")[0]):
+            yield self
         if self.offset != len(self.data):
             raise ValueError("has more than it states")
 
 
 def _cameras_binary(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
-    file = _Binary(path)
-    for _ in range(file.take("Q")[0]):
+    for file in _Binary(path).rows():
         number, kind, width, height = file.take("IiQQ")
         name = pycolmap.CameraModelId(kind).name
         yield number, ColmapCamera(name, width, height, file.take(f"{parameter_count(name)}d"))
-    file.end()
 
 
 def _images_binary(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    file = _Binary(path)
-    for _ in range(file.take("Q")[0]):
+    for file in _Binary(path).rows():
         number, *pose, camera = file.take("I7dI")
         yield number, ModelImage(file.name(), camera, np.array(pose[:4]), np.array(pose[4:]))
         file.skip(24 * file.take("Q")[0])  # 2D points
-    file.end()
 
 
 def _rigs_binary(path: Path) -> Iterator[int]:
-    file = _Binary(path)
-    for _ in range(file.take("Q")[0]):
+    for file in _Binary(path).rows():
         number, sensors = file.take("II")
         file.skip(8 * (sensors > 0))  # the reference sensor
         for _ in range(sensors - 1):
             file.skip(56 * file.take("iIB")[-1])  # a pose, if it has one
         yield number
-    file.end()
 
 
 def _frames_binary(path: Path) -> Iterator[tuple[int, int]]:
     """Yield image and frame of the images that a rig's cameras took together."""
-    file = _Binary(path)
-    for _ in range(file.take("Q")[0]):
+    for file in _Binary(path).rows():
         frame, *_, count = file.take("II7dI")  # with rig and pose
         for _ in range(count):
             sensor, _, number = file.take("iIQ")
             if sensor == CAMERA_SENSOR:
                 yield number, frame
-    file.end()
 
 
 def _points_binary(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8], str]:
-    file = _Binary(path)
-    starts = []
-    for _ in range(file.take("Q")[0]):
+    file, starts = _Binary(path), []
+    for _ in file.rows():
         starts.append(file.offset)
         file.skip(43)  # number, position, color, error
         file.skip(8 * file.take("Q")[0])  # track
-    file.end()
     rows = np.frombuffer(file.data, np.uint8)[np.array(starts, int)[:, None] + np.arange(8, 35)]
     return rows[:, :24].copy().view("<f8").reshape(-1, 3), rows[:, 24:].copy(), ""
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import MISSING, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -48,13 +48,11 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
     ours = {each.name for each in fields(BitymiDataParserConfig)} - {"_target"}
     if format == "instant-ngp":
         ours -= {"scale_factor", "scene_scale"}  # there scene_scale multiplies the positions
-    options: dict[str, Any] = {}
-    for each in fields(config):
-        value = getattr(config, each.name)
-        default = each.default if each.default is not MISSING else each.default_factory()  # type: ignore[misc]
-        if each.name in ours:
-            options[each.name] = value
-        elif each.name not in STOCK_IGNORED and value != default:
+    options, stock = {}, type(config)()
+    for name, value in vars(config).items():
+        if name in ours:
+            options[name] = value
+        elif name not in STOCK_IGNORED and value != getattr(stock, name):
             return config
     if not getattr(config, "load_3D_points", options.get("ply_path") is not None):
         options["points"] = "random"

@@ -290,9 +290,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
         """Return camera and batch of a training view without effect on the order."""
         data = self._batch(self.cached_train[index])
-        camera = self.train_dataset.cameras[index : index + 1].to(self.device)
-        camera.metadata = {**(camera.metadata or {}), "cam_idx": index}
-        return camera, data
+        return self.train_dataset.cameras[index : index + 1].to(self.device), data
 
     def eval_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
         """Return camera and batch of a held-out view."""

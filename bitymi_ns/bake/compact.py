@@ -98,13 +98,9 @@ class Coder:
         progress: Progress = no_progress,
         held_out: Sequence[View] = (),
     ) -> None:
-        """
-        Args:
-            baked: with lean view colours.
-            views: training views; without any the reference steps are taken.
-            background: [3] colour behind the scene.
-            held_out: views on which alternatives are stated; without any the training views.
-        """
+        """Measure `baked`, with lean view colours, in the training views; without any the reference steps are taken.
+        `background`: [3] colour behind the scene. `held_out`: views on which alternatives are stated; without any the
+        training views."""
         self._baked, self._pictures = baked, Pictures(views, background, options.views, baked.device)
         self._held_out = Pictures(held_out, background, options.views, baked.device)
         scene = baked.unquantised()
@@ -176,14 +172,7 @@ def compacted(
     held_out: Sequence[View] = (),
 ) -> Rounded:
     """Round the surfels of a bake to the values of a compact bundle, in Morton order, and choose the coding of the
-    texels.
-
-    Args:
-        baked, views, background, held_out: as in `Coder`.
-
-    Raises:
-        ValueError: the target cannot be reached.
-    """
+    texels. Arguments as of `Coder`. Raises ValueError: the target cannot be reached."""
     options = options or Compact()
     return choose(Coder(baked, views, background, options, progress, held_out), options, progress)
 

@@ -26,14 +26,8 @@ class EarlyStopping(Generic[S]):
     """
 
     def __init__(self, steps: int, checks: int, patience: int, psnr: float, first: S) -> None:
-        """
-        Args:
-            steps: maximum number.
-            checks: evaluations over the run.
-            patience: evaluations without a gain before the end.
-            psnr: of the views before the first step, dB; NaN without any.
-            first: initial state.
-        """
+        """Begin with a state and the PSNR of the views before the first step, dB; NaN without any. `steps`: maximum
+        number. `checks`: evaluations over the run. `patience`: evaluations without a gain before the end."""
         self._steps, self._patience = steps, patience
         self._every = max(1, -(-steps // checks))
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
@@ -43,15 +37,8 @@ class EarlyStopping(Generic[S]):
         return done % self._every == 0 or done == self._steps
 
     def update(self, done: int, psnr: float, state: Callable[[], S]) -> bool:
-        """Record an evaluation after a step.
-
-        Args:
-            psnr: of the views, dB; NaN without any.
-            state: makes a copy of the state.
-
-        Returns:
-            False where the last `patience` evaluations were all worse than the best.
-        """
+        """Record an evaluation after a step; return False where the last `patience` evaluations were all worse than the
+        best. `psnr`: of the views, dB; NaN without any. `state`: makes a copy of the state."""
         self.done = done
         if math.isnan(psnr):
             self.best = state()

@@ -31,11 +31,8 @@ class Pictures:
     def __init__(
         self, views: Sequence[View], background: Tensor, most: int, device: torch.device | str = "cpu"
     ) -> None:
-        """
-        Args:
-            views: training views, of which up to `most` with an unmasked pixel are taken, spread over all.
-            background: [3] colour behind the scene.
-        """
+        """Take up to `most` of the training views that have an unmasked pixel, spread over all. `background`: [3]
+        colour behind the scene."""
         taken = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
         chosen = [*filter(_counts, taken)] or [*islice(filter(_counts, views), most)]
         self._device, self._background = device, background.to(device)

@@ -244,14 +244,9 @@ def export(
     first: Camera | None = None,
     **options: Any,
 ) -> Bundle:
-    """Write a bundle; returns and raises as `write_bundle`.
-
-    Args:
-        background: colour behind the surfels.
-        statistics: added to those of the bake.
-        first: camera of the poster, the one with which viewers start: the first held-out one of cameras.json, else its
-            first; None = no poster.
-    """
+    """Write a bundle; returns and raises as `write_bundle`. `background`: colour behind the surfels. `statistics`:
+    added to those of the bake. `first`: camera of the poster, the one with which viewers start: the first held-out one
+    of cameras.json, else its first; None = no poster."""
     return write_bundle(
         folder,
         baked.scene,

@@ -50,13 +50,8 @@ def listed_errors(
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
     """Compute the pixels per scale unit [N, 2] of every surfel along u and v in the view that shows it largest; 0 if no
-    view shows it.
-
-    Args:
-        surfels: per-surfel parameters, N rows.
-        extent: half side, in scale units, of the square that has to meet the image for a view to count.
-        near: near plane, camera z.
-    """
+    view shows it. `surfels`: per-surfel parameters, N rows. `extent`: half side, in scale units, of the square that has
+    to meet the image for a view to count. `near`: near plane, camera z."""
     at = (surfels["means"], tangents(surfels["quats"]), surfels["log_scales"].exp())
     return max_projected_extent(*at, cameras, extent, near) / (2.0 * extent)
 

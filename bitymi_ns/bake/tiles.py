@@ -43,15 +43,9 @@ class TileVisibility:
 
 
 def texel_centers(count: int, extent: Tensor) -> Tensor:
-    """Compute surfel coordinates of texel centres along one axis: (i + 0.5) / count * 2 extent - extent.
-
-    Args:
-        count: texels along the axis.
-        extent: [..., 1] half sides of tiles in scale units (e; 3 covers exactly the support).
-
-    Returns:
-        [..., count] in the dtype of the extents.
-    """
+    """Compute surfel coordinates [..., count] of the centres of `count` texels along one axis: (i + 0.5) / count * 2
+    extent - extent, in the dtype of the extents. `extent`: [..., 1] half sides of tiles in scale units (e; 3 covers
+    exactly the support)."""
     return extent * ((2.0 * torch.arange(count, device=extent.device) + 1.0) / count - 1.0)
 
 

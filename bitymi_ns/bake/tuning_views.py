@@ -91,10 +91,7 @@ class TuningViews(Sequence[TuningView]):
     """Views of a bake, traced when they are needed and kept while there is budget for them."""
 
     def __init__(self, texels: TexelList, views: Sequence[View], background: Tensor, budget: MemoryBudget) -> None:
-        """
-        Args:
-            background: [3] colour behind the scene.
-        """
+        """Trace views before a background, [3] colour behind the scene."""
         self._texels, self._views, self._budget = texels, views, budget
         self._background = background.to(texels.device)
         self._kept: dict[int, TuningView] = {}
@@ -154,14 +151,9 @@ class TuningViews(Sequence[TuningView]):
     def step(
         self, index: int, texels: Tensor, share: Tensor, rate: float, ssim_weight: float, read: Tensor | None = None
     ) -> None:
-        """Take a gradient step on texels with a view's loss, summed over pixels and channels instead of averaged.
-
-        Args:
-            texels: [T, 3], moved in place: texel t by -rate share[t] times its gradient.
-            share: [T].
-            ssim_weight: share of 1 - SSIM in the loss.
-            read: [T, 3] texels that the picture shows; None = those that are moved.
-        """
+        """Take a gradient step on texels with a view's loss, summed over pixels and channels instead of averaged: move
+        `texels` [T, 3] in place, texel t by -rate share[t] times its gradient, with `share` [T]. `ssim_weight`: share
+        of 1 - SSIM in the loss. `read`: [T, 3] texels that the picture shows; None = those that are moved."""
         view = self[index]
         if read is None:
             read = texels if len(view.lists) == 1 else texels.clone()  # a band must not read what another has moved

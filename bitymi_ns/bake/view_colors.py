@@ -67,13 +67,8 @@ def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
 
 
 def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Tensor:
-    """Evaluate the blended colour max(f_view + 0.5, 0) by the renderers' kernels: [n, D, 3].
-
-    Args:
-        kind: a name of `ops.VIEW_COLORS`.
-        params: parameters of n surfels, all or lean.
-        directions: [n, D, 3] unit vectors.
-    """
+    """Evaluate the blended colour max(f_view + 0.5, 0) by the renderers' kernels: [n, D, 3]. `kind`: a name of
+    `ops.VIEW_COLORS`. `params`: parameters of n surfels, all or lean. `directions`: [n, D, 3] unit vectors."""
     origin = directions.new_zeros(3)
     columns = [view_color(kind, params, d.contiguous(), origin) for d in directions.unbind(1)]
     return view_base(torch.stack(columns, dim=1))
@@ -274,15 +269,9 @@ def fewer_sites(
     at: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
 ) -> Callable[[int, Tensor], tuple[Tensor, Tensor]]:
     """Rank the sites by how much they are needed, and return a fit of the first ones to the colour of all, by
-    Levenberg-Marquardt.
-
-    Args:
-        weight: [n, D'] of the directions that `Directions.subset` selects.
-        vectors, rgb: [n, K, 3] of all sites.
-
-    Returns:
-        a function of a number of sites below K, and of rows, to base [m, 3] and terms [m, number - 1, 6].
-    """
+    Levenberg-Marquardt: a function of a number of sites below K, and of rows, to base [m, 3] and terms [m, number - 1,
+    6]. `weight`: [n, D'] of the directions that `Directions.subset` selects. `vectors`, `rgb`: [n, K, 3] of all
+    sites."""
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
     unit = torch.cat([at.subset(at.unit, FIT_VIEWS), outside], dim=1)
     weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)

@@ -35,13 +35,8 @@ MOST_COEFFICIENT = 1 << 24
 def encode_surfels(
     codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None, digest: Digest
 ) -> tuple[dict[str, Any], bytes]:
-    """Encode surfels.bin; returns its entries in bundle.json and its bytes.
-
-    Args:
-        residual: [N, 3] mean residuals: green, red - green, blue - green.
-        residual_step: their step.
-        alpha: [N] mean alphas, 128 = 1; None if opaque.
-    """
+    """Encode surfels.bin; returns its entries in bundle.json and its bytes. `residual`: [N, 3] mean residuals: green,
+    red - green, blue - green. `residual_step`: their step. `alpha`: [N] mean alphas, 128 = 1; None if opaque."""
     columns = {**codes.columns, "residual": residual}
     if alpha is not None:
         columns["alpha"] = alpha[:, None]

@@ -79,14 +79,9 @@ def descriptor(format: Format) -> bytes:
 def write_ktx2(
     path: str | Path, payload: Sequence[bytes], format: Format, width: int, height: int, writer: str
 ) -> None:
-    """Write a 2D array texture with one level, without supercompression.
-
-    Args:
-        payload: one bytes object per layer, rows from the top.
-        format: bc7, uint8 (RGBA) or fp16 (RGBA).
-        width, height: in texels; multiples of 4 for bc7.
-        writer: name and version of the program (KTXwriter).
-    """
+    """Write a 2D array texture with one level, without supercompression. `payload`: one bytes object per layer, rows
+    from the top. `format`: bc7, uint8 (RGBA) or fp16 (RGBA). `width`, `height`: in texels; multiples of 4 for bc7.
+    `writer`: name and version of the program (KTXwriter)."""
     layout = _LAYOUTS[format]
     expected = layer_bytes(format, width, height)
     if not payload or any(len(layer) != expected for layer in payload):
@@ -111,15 +106,8 @@ def write_ktx2(
 
 
 def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
-    """Parse the header.
-
-    Args:
-        data: the first `HEADER_LIMIT` bytes of the file, or more.
-        size: bytes of the whole file.
-
-    Raises:
-        Ktx2Error: another kind of file, another size than the header states, or contradictory fields.
-    """
+    """Parse the header in the first `HEADER_LIMIT` bytes of a file, or more. `size`: bytes of the whole file. Raises
+    Ktx2Error: another kind of file, another size than the header states, or contradictory fields."""
     view = memoryview(data)
     if len(view) < _HEADER.size or bytes(view[:12]) != IDENTIFIER:
         raise Ktx2Error("not a KTX2 file")

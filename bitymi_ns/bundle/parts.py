@@ -85,13 +85,8 @@ class Parts:
     """Files of a bundle by name."""
 
     def __init__(self, bundle: Path, file: BufferedReader | None = None, inside: bool = False) -> None:
-        """Prefer `parts_of`.
-
-        Args:
-            bundle: folder or file, also for messages.
-            file: the opened single file; None for a folder.
-            inside: refuse links out of the folder.
-        """
+        """Prefer `parts_of`. `bundle`: folder or file, also for messages. `file`: the opened single file; None for a
+        folder. `inside`: refuse links out of the folder."""
         self.bundle, self._file, self._inside = bundle, file, inside
         self._entries, self._end = ({}, 0) if file is None else _read_directory(file)
 
@@ -137,15 +132,8 @@ class Parts:
 
 @contextmanager
 def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
-    """Open the files of a bundle.
-
-    Args:
-        bundle: folder or single file.
-        inside: refuse links out of the folder, because its contents are copied on.
-
-    Raises:
-        BundleError: the single file is damaged.
-    """
+    """Open the files of a bundle, a folder or single file. `inside`: refuse links out of the folder, because its
+    contents are copied on. Raises BundleError: the single file is damaged."""
     path = Path(bundle)
     if not os.path.isfile(path):
         yield Parts(path, inside=inside)

@@ -17,13 +17,9 @@ def write_ply(
     comments: Sequence[str] = (),
     more: Mapping[str, Mapping[str, npt.NDArray]] | None = None,
 ) -> None:
-    """Write columns as properties of `vertex`, in order.
-
-    Args:
-        columns: name to [N] array; integer columns become `int`, the others `float`.
-        comments: header comments, one line each.
-        more: columns of further elements by name, in order.
-    """
+    """Write columns as properties of `vertex`, in order. `columns`: name to [N] array; integer columns become `int`,
+    the others `float`. `comments`: header comments, one line each. `more`: columns of further elements by name, in
+    order."""
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     body = []
     for element, properties in {"vertex": columns, **(more or {})}.items():
@@ -44,15 +40,8 @@ def write_ply(
 
 
 def read_header(data: bytes | bytearray, size: int) -> Header:
-    """Parse the header.
-
-    Args:
-        data: the first `HEADER_LIMIT` bytes of the file, or more.
-        size: bytes of the whole file.
-
-    Raises:
-        PlyError: another kind of PLY, or a size that does not match.
-    """
+    """Parse the header in the first `HEADER_LIMIT` bytes of a file, or more. `size`: bytes of the whole file. Raises
+    PlyError: another kind of PLY, or a size that does not match."""
     header = parse_header(data)
     if header.order != "<":
         raise PlyError("not a binary little-endian PLY file of version 1.0")
@@ -71,17 +60,9 @@ def read_header(data: bytes | bytearray, size: int) -> Header:
 
 
 def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
-    """Parse a file written by `write_ply`.
-
-    Args:
-        data: the whole file.
-
-    Returns:
-        element to name to [N] float32 or int32 array, in the file's order; the first element is `vertex`.
-
-    Raises:
-        PlyError: another kind of PLY, a length that does not match the header, or a value that is not finite.
-    """
+    """Parse a whole file written by `write_ply`: element to name to [N] float32 or int32 array, in the file's order;
+    the first element is `vertex`. Raises PlyError: another kind of PLY, a length that does not match the header, or a
+    value that is not finite."""
     header = read_header(data, len(data))
     elements, at = {}, header.start
     for element, declared in header.elements.items():

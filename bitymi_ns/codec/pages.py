@@ -35,15 +35,9 @@ def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
 
 
 def listed_tiles(sizes: Tensor, chunk: int = 1 << 20) -> Iterator[tuple[tuple[int, int], Tensor, Tensor]]:
-    """Yield the tiles of a texel list in chunks of one size, without surfels that have no tile.
-
-    Args:
-        sizes: [N, 2] (r_u, r_v) of the tiles.
-        chunk: texels per chunk; tiles are never split.
-
-    Yields:
-        (r_u, r_v), rows [n] int64 of the surfels, texel rows [n, r_v, r_u] int64.
-    """
+    """Yield the tiles of a texel list in chunks of one size, without surfels that have no tile: (r_u, r_v), rows [n]
+    int64 of the surfels, texel rows [n, r_v, r_u] int64. `sizes`: [N, 2] (r_u, r_v) of the tiles. `chunk`: texels per
+    chunk; tiles are never split."""
     first = first_texels(sizes)
     for r_u, r_v, members in size_classes(sizes):
         inside = torch.arange(r_u * r_v, device=sizes.device).view(r_v, r_u)
@@ -58,16 +52,8 @@ def first_texels(sizes: Tensor) -> Tensor:
 
 
 def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -> Tensor:
-    """Compute the flat index (layer * height + y) * width + x of each texel of equally sized tiles.
-
-    Args:
-        tiles: [N, 5] int32 (x, y, layer, r_u, r_v).
-        size: (r_u, r_v).
-        width, height: page size in texels.
-
-    Returns:
-        [N, r_v, r_u] int64.
-    """
+    """Compute the flat index (layer * height + y) * width + x, [N, r_v, r_u] int64, of each texel of equally sized
+    tiles. `tiles`: [N, 5] int32 (x, y, layer, r_u, r_v). `size`: (r_u, r_v). `width`, `height`: page size in texels."""
     x, y, layer = tiles[:, 0].long(), tiles[:, 1].long(), tiles[:, 2].long()
     origin = (layer * height + y) * width + x  # [N]
     i, j = (torch.arange(side, device=tiles.device) for side in size)

@@ -79,16 +79,9 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
 
 
 def fetch_texels(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Fetch texels bilinearly, clamped to the outer texel centres of each tile.
-
-    Args:
-        scene: on the CPU, with an atlas.
-        tiles: [n, 5] int64, of the scene.
-        u, v: [n, r_u] and [n, r_v] coordinates in half sides of the tiles, from -1 to 1 inside.
-
-    Returns:
-        [n, r_v, r_u, 4] residual colour and alpha; alpha is 0 if the scene has no alpha texels.
-    """
+    """Fetch texels bilinearly, clamped to the outer texel centres of each tile: [n, r_v, r_u, 4] residual colour and
+    alpha; alpha is 0 if the scene has no alpha texels. `scene`: on the CPU, with an atlas. `tiles`: [n, 5] int64, of
+    the scene. `u`, `v`: [n, r_u] and [n, r_v] coordinates in half sides of the tiles, from -1 to 1 inside."""
     assert scene.atlas is not None
     _, height, width, _ = scene.atlas.shape
     (low_u, high_u, fu), (low_v, high_v, fv) = (

@@ -16,13 +16,8 @@ MeshFormat = Literal["ply", "glb", "obj"]
 
 def mesh_bytes(mesh: Triangles, form: MeshFormat, up: Tensor, origin: Tensor, note: str = "") -> bytes:
     """Encode a mesh file with vertex colors and normals. PLY and OBJ keep the mesh's axes and have the note as a
-    comment; glTF has +y up and the origin in its node.
-
-    Args:
-        up: [3] up direction of the mesh.
-        origin: [3] origin of the positions.
-        note: one line that states the origin; empty: none.
-    """
+    comment; glTF has +y up and the origin in its node. `up`: [3] up direction of the mesh. `origin`: [3] origin of the
+    positions. `note`: one line that states the origin; empty: none."""
     normals = _normals(mesh)
     if form == "glb":
         return surface_glb(mesh, normals, upright(up, origin))

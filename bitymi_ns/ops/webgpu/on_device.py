@@ -210,7 +210,7 @@ class SceneOnDevice:
                 attachment = {"view": to, "load_op": "clear", "store_op": "store"}
                 work = encoder.begin_render_pass(color_attachments=[attachment])
                 work.set_pipeline(pipeline)
-                work.set_bind_group(0, self._group(p.halve_layout, finer))
+                work.set_bind_group(0, self._group(pipeline.get_bind_group_layout(0), finer))
                 work.draw(3)
                 work.end()
         self._device.queue.submit([encoder.finish()])

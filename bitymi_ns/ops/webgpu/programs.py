@@ -60,39 +60,21 @@ class Programs:
         """Bind group layouts of `draw`: scene and frame, atlas, batch."""
         wgpu = library()
         vertex, fragment = wgpu.ShaderStage.VERTEX, wgpu.ShaderStage.FRAGMENT
-        make = self.device.create_bind_group_layout
+
+        def group(*resources: tuple[int, dict[str, Any]]) -> Any:
+            entries = [{"binding": k, "visibility": seen, **of} for k, (seen, of) in enumerate(resources)]
+            return self.device.create_bind_group_layout(entries=entries)
+
         # the binding declares whether the target's format can be filtered
         filters = self.format != "rgba32float" or "float32-filterable" in self.device.features
-        read = {"type": "read-only-storage"}
-        atlas = {"sample_type": "float", "view_dimension": "2d-array"}
+        before = {"sample_type": "float" if filters else "unfilterable-float"}
+        atlas = {"texture": {"sample_type": "float", "view_dimension": "2d-array"}}
+        batch = {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": 16}
+        arrays = [(vertex, {"buffer": {"type": "read-only-storage"}})] * 4
         return [
-            make(
-                entries=[
-                    {"binding": 0, "visibility": vertex | fragment, "buffer": {"type": "uniform"}},
-                    *({"binding": k, "visibility": vertex, "buffer": read} for k in range(1, 5)),
-                ]
-            ),
-            make(
-                entries=[
-                    {"binding": 0, "visibility": fragment, "texture": atlas},
-                    {"binding": 1, "visibility": fragment, "sampler": {"type": "filtering"}},
-                    {"binding": 2, "visibility": fragment, "texture": atlas},
-                ]
-            ),
-            make(
-                entries=[
-                    {
-                        "binding": 0,
-                        "visibility": vertex | fragment,
-                        "buffer": {"type": "uniform", "has_dynamic_offset": True, "min_binding_size": 16},
-                    },
-                    {
-                        "binding": 1,
-                        "visibility": fragment,
-                        "texture": {"sample_type": "float" if filters else "unfilterable-float"},
-                    },
-                ]
-            ),
+            group((vertex | fragment, {"buffer": {"type": "uniform"}}), *arrays),
+            group((fragment, atlas), (fragment, {"sampler": {"type": "filtering"}}), (fragment, atlas)),
+            group((vertex | fragment, {"buffer": batch}), (fragment, {"texture": before})),
         ]
 
     def _draw(self, color: dict[str, str]) -> Any:
@@ -127,19 +109,9 @@ class Programs:
         """Build the pipeline that halves a page into a target of this format, with `alpha` weighting colours by it."""
         entry = f"halve{'_alpha' if alpha else ''}_{'bytes' if format == 'rgba8unorm' else 'floats'}"
         module = self._halve_module
-        wgpu = library()
         return self.device.create_render_pipeline(
-            layout=self.device.create_pipeline_layout(bind_group_layouts=[self.halve_layout]),
+            layout=library().AutoLayoutMode.auto,
             vertex={"module": module, "entry_point": "page"},
-            primitive={"topology": wgpu.PrimitiveTopology.triangle_list},
+            primitive={"topology": "triangle-list"},
             fragment={"module": module, "entry_point": entry, "targets": [{"format": format}]},
-        )
-
-    @cached_property
-    def halve_layout(self) -> Any:
-        """Bind group layout of `halve`: the finer page."""
-        texture = {"sample_type": "unfilterable-float", "view_dimension": "2d"}
-        fragment = library().ShaderStage.FRAGMENT
-        return self.device.create_bind_group_layout(
-            entries=[{"binding": 0, "visibility": fragment, "texture": texture}]
         )

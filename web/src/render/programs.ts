@@ -51,31 +51,21 @@ export class Programs {
 
   private makeLayouts(): [GPUBindGroupLayout, GPUBindGroupLayout, GPUBindGroupLayout] {
     const { VERTEX, FRAGMENT } = GPUShaderStage;
-    const make = (...entries: GPUBindGroupLayoutEntry[]): GPUBindGroupLayout =>
-      this.device.createBindGroupLayout({ entries });
-    const read = (binding: number): GPUBindGroupLayoutEntry => ({
-      binding,
-      visibility: VERTEX,
-      buffer: { type: 'read-only-storage' },
+    const make = (...resources: Omit<GPUBindGroupLayoutEntry, 'binding'>[]): GPUBindGroupLayout =>
+      this.device.createBindGroupLayout({ entries: resources.map((of, binding) => ({ binding, ...of })) });
+    const uniform = (buffer: GPUBufferBindingLayout): Omit<GPUBindGroupLayoutEntry, 'binding'> => ({
+      visibility: VERTEX | FRAGMENT,
+      buffer: { type: 'uniform', ...buffer },
     });
+    const array = { visibility: VERTEX, buffer: { type: 'read-only-storage' } } as const;
+    const atlas = { visibility: FRAGMENT, texture: { viewDimension: '2d-array' } } as const;
     return [
-      make(
-        { binding: 0, visibility: VERTEX | FRAGMENT, buffer: { type: 'uniform' } },
-        ...[1, 2, 3, 4].map((k) => read(k)),
-      ),
-      make(
-        { binding: 0, visibility: FRAGMENT, texture: { sampleType: 'float', viewDimension: '2d-array' } },
-        { binding: 1, visibility: FRAGMENT, sampler: { type: 'filtering' } },
-        { binding: 2, visibility: FRAGMENT, texture: { sampleType: 'float', viewDimension: '2d-array' } },
-      ),
-      make(
-        {
-          binding: 0,
-          visibility: VERTEX | FRAGMENT,
-          buffer: { type: 'uniform', hasDynamicOffset: true, minBindingSize: 16 },
-        },
-        { binding: 1, visibility: FRAGMENT, texture: { sampleType: 'unfilterable-float' } },
-      ),
+      make(uniform({}), array, array, array, array),
+      make(atlas, { visibility: FRAGMENT, sampler: {} }, atlas),
+      make(uniform({ hasDynamicOffset: true, minBindingSize: 16 }), {
+        visibility: FRAGMENT,
+        texture: { sampleType: 'unfilterable-float' },
+      }),
     ];
   }
 

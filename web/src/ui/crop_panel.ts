@@ -152,15 +152,16 @@ export class CropPanel {
     const last = this.undone.pop();
     if (!last) return;
     Object.assign(this.all, last);
-    this.before = this.copy();
-    this.file.changed();
-    this.show();
-    this.apply();
+    this.settle();
   }
 
   // Keeps a finished change, and the state before it for undo.
   private changed(): void {
     this.undone.push(this.before);
+    this.settle();
+  }
+
+  private settle(): void {
     this.before = this.copy();
     this.file.changed();
     this.show();

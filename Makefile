@@ -17,7 +17,7 @@
 # make web     builds the viewer's page from web/ into bitymi_ns/view/page, which is committed: users need no Node.js
 # make web-test  checks and tests of the page's sources, and that the committed page is what they give; says that it is
 #              skipped where there is no Node.js. `make test` begins with it
-# make lint    ruff and clang-format
+# make lint    ruff, basedpyright (types) and clang-format
 # Every step leaves a stamp in .venv and is skipped when nothing it depends on has changed.
 
 PYTHON ?= python3
@@ -175,6 +175,7 @@ bench: setup $(WORK)/captures/demo/transforms.json
 lint: $(VENV)/.stamp-deps
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/basedpyright
 	$(BIN)/clang-format --dry-run -Werror $(CXX_FILES)
 
 format: $(VENV)/.stamp-deps

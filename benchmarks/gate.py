@@ -96,7 +96,7 @@ class Calibration:
         self.run()
         self.seconds.clear()  # warm-up
 
-    def run(self, *_: Any) -> None:
+    def run(self, *unused: Any) -> None:
         start = time.process_time()
         x = self._matrix
         for _ in range(4):
@@ -181,12 +181,13 @@ def measure(capture: Path | None) -> Scenes:
     os.environ |= THREADS  # read when torch loads OpenMP
     found = {}
     with tempfile.TemporaryDirectory() as folder:
-        jobs = [("room", generate(Path(folder) / "room", views=24, width=160, height=120, points=3000), 1)]
+        room = generate(Path(folder) / "room", views=24, width=160, height=120, points=3000)
+        jobs: list[tuple[str, Path, int]] = [("room", room, 1)]
         jobs += [] if capture is None else [(capture.name, capture.absolute(), 2)]
-        for name, *job in jobs:
+        for name, data, downscale in jobs:
             say(f"gate: {name}")
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-                found[name] = process.submit(run_job, *job).result()
+                found[name] = process.submit(run_job, data, downscale).result()
     return found
 
 

@@ -4,8 +4,9 @@ with gsplat's MCMC strategy, and render both at the held-out cameras: PSNR and m
 Bundles are those of `long.py --keep`. `--train` trains the Gaussians first, from the same points, with the learning
 rates of gsplat's example and the strategy's regularisation."""
 
+import importlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -20,6 +21,7 @@ from torch.nn.functional import normalize
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.constants import SH_C0
+from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
@@ -64,12 +66,12 @@ def rasterized(gsplat: Any, g: dict[str, Tensor]) -> Frames:
 
 def inferred(g: dict[str, Tensor]) -> Frames:
     """Render Gaussians with gsplat's inference renderer, converted to half precision beforehand."""
-    from gsplat.experimental import GaussianInferenceRenderer, GaussianInferenceScene
+    experimental = importlib.import_module("gsplat.experimental")  # which the gsplat of nerfstudio lacks
 
-    scene = GaussianInferenceScene.from_gaussian_tensors(
+    scene = experimental.GaussianInferenceScene.from_gaussian_tensors(
         *g.values(), sh_degree=3, sh_compression="none", id=f"none{len(g['means'])}"
     )
-    renderer = GaussianInferenceRenderer(scene)
+    renderer = experimental.GaussianInferenceRenderer(scene)
 
     def make(camera: Camera) -> Callable[[], Tensor]:
         view = {"viewmat": camera.viewmat, "K": camera.K, "width": camera.width, "height": camera.height}
@@ -94,7 +96,7 @@ def first_gaussians(capture: SplitCapture, most: int, extent: float) -> dict[str
     }
 
 
-def activated(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def activated(p: Tensors) -> dict[str, Tensor]:
     """Compute means, quats (unit), scales, opacities, sh [N, 16, 3] from parameters as in `first_gaussians`."""
     return {
         "means": p["means"],

@@ -174,7 +174,7 @@ def measure(run: LongRun) -> Figures:
         results |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "mean_exposure_psnr")}
     found: Figures = {"train": costs | {"steps": run.steps, "rollbacks": training.guard.rollbacks}}
     views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
-    views = corrected(views, exposure.state_dict(), [view.file for view in views])
+    views = corrected(views, exposure.state_dict(), [view.file for view in views if view.file])
     name = "-".join((run.data.stem, *shlex.split(run.row), f"{run.steps}-{run.seed}"))
     for size in (None, *options.megabytes) if options.bake else ():
         form = "compact" if size is None else f"{size:g} MB"
@@ -196,7 +196,7 @@ def main() -> None:
     torch.set_num_threads(1)
     options.bake |= options.keep is not None or bool(options.megabytes)
     runs = [
-        LongRun(data, row, *map(int, run.split("/")), seed, options)
+        LongRun(data, row, *map(int, run.split("/")), seed=seed, options=options)
         for data, run, row, seed in itertools.product(options.data, options.runs, options.rows, options.seeds)
     ]
     for row in options.rows:

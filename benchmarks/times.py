@@ -40,12 +40,14 @@ from torch.nn.functional import l1_loss
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops.baked import IMAGES
 from bitymi_ns.ops.baked_cuda import Stage
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.field import HashField, TexelField
 
 CPU = torch.device("cpu")
 WARM_UP = 2
@@ -67,7 +69,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, dict[str, Run]]:
     scene, camera = trained_like(n, width, height, CPU)
     baked, _ = textured(n, width, height, CPU)
     q, field, bound = scene.surfels, scene.field, scene.config.weight_bound
-    assert field is not None
+    assert isinstance(field, HashField)
     geometry = geometry_of(q)
     project = partial(ops.project, *geometry, camera, scene.near)
     projection = project()
@@ -211,7 +213,7 @@ def baked(n: int, width: int, height: int, device: torch.device, every: bool = F
     """Prepare a frame with a BC7 atlas; `every`: with all images."""
     scene, camera = textured(n, width, height, device)
     if every:
-        return lambda: scene.render_views([camera], None, ops.baked.IMAGES)
+        return lambda: scene.render_views([camera], None, tuple(IMAGES))
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
     return renderer.run
@@ -223,7 +225,7 @@ def training(n: int, width: int, height: int, device: torch.device, tiled: bool 
     scene, camera = (with_texels if tiled else trained_like)(n, width, height, device)
     scene.config.max_fragments = most
     # rates 0: the work of a step without changing the scene
-    descent = ops.TexelDescent(scene.field.share, 0.0) if tiled else None
+    descent = ops.TexelDescent(scene.field.share, 0.0) if isinstance(scene.field, TexelField) else None
     optimizer = torch.optim.Adam((scene.surfels if tiled else scene).parameters(), lr=0.0, fused=True)
     photo = torch.rand(height, width, 3, device=device)
 

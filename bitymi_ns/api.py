@@ -148,7 +148,7 @@ def rasterize(
     )
     surfels = {"means": means, "quats": quats, "log_scales": scales.log()}
     surfels |= {"opacity_logits": _logit(opacities), "beta_raw": _logit(betas / BETA_MAX)}
-    projection = project(*geometry_of(surfels), camera, near)
+    projection = project(*geometry_of(surfels), camera=camera, near=near)
     base = colors - COLOR_BIAS
     if not maps and can_rasterize(means.device):
         image, marks = rasterize_image(projection, base)

@@ -52,7 +52,7 @@ def png(panels: Sequence[Panel], legend: Sequence[Line2D] = (), most: int = 3) -
         axes.set_xlabel(panel.x, fontsize=9)
         axes.set_ylabel(panel.y, fontsize=9)
     if len(legend) > 1:
-        longest = max(len(handle.get_label()) for handle in legend)
+        longest = max(len(str(handle.get_label())) for handle in legend)
         ncols = max(1, min(len(legend), int(width * 16) // (longest + 7)))
         figure.legend(handles=legend, loc="outside lower center", frameon=False, fontsize=8, ncols=ncols)
     buffer = io.BytesIO()

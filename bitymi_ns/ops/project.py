@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from .backend import check_shapes, cuda_backend, dense, kernel, on_same_device
 from .constants import FRAME, GEOM
-from .parameters import GEOMETRY, GEOMETRY_PARAMETERS
+from .parameters import GEOMETRY, GEOMETRY_PARAMETERS, Tensors
 from .texel import TexelAlpha
 
 
@@ -193,14 +193,16 @@ def refuse_skew(camera: CameraLike) -> None:
         raise ValueError("cameras with skew (K[0, 1] != 0) are not supported: undistort the images first")
 
 
-def geometry_of(surfels: Mapping[str, Tensor]) -> list[Tensor]:
+def geometry_of(surfels: Tensors) -> list[Tensor]:
     """List the surfels' parameters of `GEOMETRY`; one that is missing has the value `Parameter.absent`. Raises
     KeyError: it has none."""
-    means = surfels["means"]
+    means, found = surfels["means"], []
     for name, parameter in GEOMETRY_PARAMETERS.items():
-        if name not in surfels and parameter.absent is not None:
-            surfels = {**surfels, name: means.new_full((len(means), *parameter.shape), parameter.absent)}
-    return [surfels[name] for name in GEOMETRY]
+        if name in surfels or parameter.absent is None:
+            found.append(surfels[name])
+        else:
+            found.append(means.new_full((len(means), *parameter.shape), parameter.absent))
+    return found
 
 
 def checked_geometry(geometry: Sequence[Tensor], camera: CameraLike) -> Sequence[Tensor]:

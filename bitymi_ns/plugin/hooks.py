@@ -53,7 +53,7 @@ def read_names_of_callers() -> None:
     command. Without: half of a command's start is spent there. Superfluous once nerfstudio asks for the one name that
     it reads.
     """
-    external_methods.inspect = SimpleNamespace(  # type: ignore[attr-defined]
+    external_methods.__dict__["inspect"] = SimpleNamespace(
         stack=lambda: [SimpleNamespace(function=frame.f_code.co_name) for frame in _callers(2)]
     )
 
@@ -82,14 +82,14 @@ def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
                     warnings.warn(f"bitymi-ns: `ns-export {COMMAND}` is not available: {cause}", stacklevel=2)
             return tyro.cli(f, *args, **options)
 
-        module.tyro = SimpleNamespace(**{**vars(tyro), "cli": cli})  # type: ignore[union-attr]
+        vars(module)["tyro"] = SimpleNamespace(**{**vars(tyro), "cli": cli})
 
 
 def _with_members(union: Any, more: Sequence[Any]) -> Any:
     """Add members to a union; keep markers around it."""
     if get_origin(union) is Annotated:
         inner, *markers = get_args(union)
-        return Annotated[(_with_members(inner, more), *markers)]  # type: ignore[return-value]
+        return Annotated[(_with_members(inner, more), *markers)]
     members = get_args(union) if get_origin(union) in (Union, UnionType) else (union,)
     return Union[(*members, *more)]  # noqa: UP007 - built at run time
 
@@ -265,7 +265,7 @@ def patch_viewer(config: Any) -> None:
     """
     for script in map(sys.modules.get, (VIEWER, "__main__")):
         if hasattr(script, "_start_viewer"):
-            script._start_viewer = partial(_start_viewer, config, script._start_viewer)  # type: ignore[union-attr]
+            vars(script)["_start_viewer"] = partial(_start_viewer, config, vars(script)["_start_viewer"])
 
 
 def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any) -> None:
@@ -319,7 +319,7 @@ def patch_render() -> None:
         else:
             script["_render_trajectory_video"](pipeline, cameras, seconds=seconds, **options)
 
-    ours = dict(
+    ours: dict[str, Any] = dict(
         install_checks=SimpleNamespace(check_ffmpeg_installed=lambda: None),
         get_path_from_json=lambda found: render.with_principal_points(stock["get_path_from_json"](found), found),
         get_interpolated_camera_path=lambda **options: render.interpolated(
@@ -331,7 +331,7 @@ def patch_render() -> None:
     names = (*ours, "VanillaDataManager")
     stock = getattr(script["_render_trajectory_video"], "stock", {name: script[name] for name in names})
     ours["VanillaDataManager"] = (stock["VanillaDataManager"], BitymiDataManager)  # those that a spiral is allowed for
-    render_trajectory.stock = stock  # type: ignore[attr-defined]
+    vars(render_trajectory)["stock"] = stock
     script.update(ours)
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from bitymi_ns.sample import textures
 from bitymi_ns.sample.textures import Image
 
-LOW = np.float32([[-3.0], [-2.5], [0.0]])
-HIGH = np.float32([[3.0], [2.5], [2.6]])
+LOW = np.array([[-3.0], [-2.5], [0.0]], np.float32)
+HIGH = np.array([[3.0], [2.5], [2.6]], np.float32)
 WALLS = (
     (textures.bricks, (), ((1.1, 0.8, "noise", 2.9, 1.1), (0.9, 1.2, "text", 0.8, 0.8))),
     (textures.wallpaper, (), ((1.2, 1.2, "rings", 0.7, 0.8), (1.3, 0.9, "text", 2.9, 1.0))),
@@ -28,10 +28,10 @@ OUTSIDE = (-40.0, 40.0, -5.0, 15.0)  # x0, x1, z0, z1 of the landscape image
 OUTSIDE_Y = 30.0
 LAMP = (-0.6, 0.9, -0.7, 0.1)  # x0, x1, y0, y1 of the light in the ceiling
 
-BOX_CENTRE, BOX_HALF = np.float32([[0.65], [-0.05], [0.38]]), np.float32([[0.32], [0.26], [0.38]])
-BOX_REACH = np.float32([[np.hypot(*BOX_HALF[:2, 0])]] * 2 + [BOX_HALF[2]])  # half sides of its bounds
+BOX_CENTRE, BOX_HALF = np.array([[0.65], [-0.05], [0.38]], np.float32), np.array([[0.32], [0.26], [0.38]], np.float32)
+BOX_REACH = np.array([[np.hypot(*BOX_HALF[:2, 0])]] * 2 + [BOX_HALF[2]], np.float32)  # half sides of its bounds
 BOX_COS, BOX_SIN = np.cos(np.float32(0.5)), np.sin(np.float32(0.5))  # of its yaw
-PLINTH = (np.float32([[-0.85], [-0.20], [0.0]]), np.float32([[-0.25], [0.40], [0.44]]))
+PLINTH = (np.array([[-0.85], [-0.20], [0.0]], np.float32), np.array([[-0.25], [0.40], [0.44]], np.float32))
 POLES = [(1.55, 0.95, 0.022, 2.6), (1.25, -0.95, 0.012, 1.35), (-1.45, -0.85, 0.016, 1.7)]  # x, y, radius, height
 
 # Surfaces. 0 to 5 are the room's sides: x low, x high, y low, y high, floor, ceiling.
@@ -39,8 +39,8 @@ LANDSCAPE, SPHERE, BOX, PLINTH_ID, BARS, POLE, KNOB = range(6, 13)
 SIDE_AXES = ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))
 """World axes of the normal of a side, of its texture's u and of its v."""
 BALLS = {
-    SPHERE: (np.float32([[-0.55], [0.10], [0.80]]), 0.36, (0.16, 0.20, 0.30), 0.55),
-    KNOB: (np.float32([[1.25], [-0.95], [1.37]]), 0.07, (0.85, 0.15, 0.10), 0.0),
+    SPHERE: (np.array([[-0.55], [0.10], [0.80]], np.float32), 0.36, (0.16, 0.20, 0.30), 0.55),
+    KNOB: (np.array([[1.25], [-0.95], [1.37]], np.float32), 0.07, (0.85, 0.15, 0.10), 0.0),
 }
 """Centre, radius, colour and gloss."""
 NEAR = np.float32(1e-4)
@@ -56,7 +56,7 @@ def _bars() -> np.ndarray:
     (x0, x1, z0, z1), y = WINDOW, float(HIGH[1, 0])
     bars.append(((x0 + x1) / 2 - 0.02, (x0 + x1) / 2 + 0.02, y - 0.03, y, z0, z1))
     bars.append((x0, x1, y - 0.03, y, (z0 + z1) / 2 - 0.015, (z0 + z1) / 2 + 0.015))
-    return np.float32(bars).reshape(-1, 3, 2, 1).transpose(2, 0, 1, 3)
+    return np.array(bars, np.float32).reshape(-1, 3, 2, 1).transpose(2, 0, 1, 3)
 
 
 BARS_LOW, BARS_HIGH = _bars()
@@ -75,7 +75,7 @@ class RoomHits:
         near, far = _slab(o, inverse, low, high)
         return np.flatnonzero((near < far) & (far > NEAR) & (near < self.t))
 
-    def shorten(self, index: np.ndarray, t: Image, meets: np.ndarray, surface: int, part: int = 0) -> None:
+    def shorten(self, index: np.ndarray, t: Image, meets: np.ndarray | bool, surface: int, part: int = 0) -> None:
         """Update the hits of rays that meet a surface at a smaller t."""
         closer = meets & (t > NEAR) & (t < self.t[index])
         chosen = index[closer]
@@ -137,14 +137,14 @@ class Room:
         for k in range(samples):
             lx = LAMP[0] + (LAMP[1] - LAMP[0]) * ((k % 8) + rng.random(dtype=np.float32)) / 8
             ly = LAMP[2] + (LAMP[3] - LAMP[2]) * ((k // 8) + rng.random(dtype=np.float32)) / (samples // 8)
-            d = np.float32([[lx], [ly], [HIGH[2, 0] - np.float32(0.01)]]) - p
+            d = np.array([[lx], [ly], [HIGH[2, 0] - np.float32(0.01)]], np.float32) - p
             r2 = _dot(d, d) + np.float32(1e-4)
             cosine, lamp_cosine = (np.maximum(x, 0) / np.sqrt(r2) for x in (_dot(d, normal), d[2]))
             blocked = RoomHits(np.ones_like(r2), *np.zeros((2, n * n), np.int8))
             self._objects(p, d, blocked)
             light += cosine * (0.35 + 0.65 * lamp_cosine) / (1 + 0.12 * r2) * (blocked.t >= np.float32(0.999))
         total = 0.42 * ambient + 1.05 * light / samples
-        warm = np.float32([1.03, 1.0, 0.95])
+        warm = np.array([1.03, 1.0, 0.95], np.float32)
         return (total[:, None] * warm).reshape(n, n, 3).astype(np.float32)
 
     def _objects(self, o: Image, d: Image, hits: RoomHits) -> None:
@@ -161,7 +161,10 @@ class Room:
             index = hits.candidates(o, inverse, *PLINTH)
             hits.shorten(index, _slab(o[:, index], inverse[:, index], *PLINTH)[0], True, PLINTH_ID)
             for part, (x, y, radius, height) in enumerate(POLES):
-                centre, reach = np.float32([[x], [y], [height / 2]]), np.float32([[radius], [radius], [height / 2]])
+                centre, reach = (
+                    np.array([[x], [y], [height / 2]], np.float32),
+                    np.array([[radius], [radius], [height / 2]], np.float32),
+                )
                 index = hits.candidates(o, inverse, centre - reach, centre + reach)
                 oo, dd = o[:, index], d[:, index]
                 t, meets = _round(oo[:2], dd[:2], centre[:2], radius)
@@ -211,7 +214,7 @@ class Room:
         gloss = 0.0
         if surface in BALLS:
             centre, radius, rgb, gloss = BALLS[surface]
-            normal, base = (p - centre) / np.float32(radius), np.float32(rgb)
+            normal, base = (p - centre) / np.float32(radius), np.array(rgb, np.float32)
         elif surface == BOX:
             normal, u, v = _face(_turned(p - BOX_CENTRE), -BOX_HALF, BOX_HALF)
             normal = _turned(normal, -BOX_SIN)
@@ -222,13 +225,15 @@ class Room:
         elif surface == BARS:
             normal, _, _ = _face(p, BARS_LOW[part, :, 0].T, BARS_HIGH[part, :, 0].T)
             brass, black, white = [0.75, 0.60, 0.20], [0.12] * 3, [0.92, 0.92, 0.90]
-            base = np.float32([brass] * UPRIGHTS + [black] * RUNGS + [white] * 2)[part]
+            base = np.array([brass] * UPRIGHTS + [black] * RUNGS + [white] * 2, np.float32)[part]
         else:
-            x, y, radius, _ = (np.float32(column)[part] for column in zip(*POLES, strict=True))
+            x, y, radius, _ = (np.array(column, np.float32)[part] for column in zip(*POLES, strict=True))
             normal = np.stack([(p[0] - x) / radius, (p[1] - y) / radius, 0 * radius])
             stripe = ((p[2] * np.float32(8)).astype(np.int32) % 2 == 0) & (part == 0)
-            base = np.where(stripe[:, None], np.float32([0.85, 0.20, 0.15]), np.float32([0.85, 0.85, 0.82]))
-        light = np.float32([[(LAMP[0] + LAMP[1]) / 2], [(LAMP[2] + LAMP[3]) / 2], HIGH[2]]) - p
+            base = np.where(
+                stripe[:, None], np.array([0.85, 0.20, 0.15], np.float32), np.array([0.85, 0.85, 0.82], np.float32)
+            )
+        light = np.array([[(LAMP[0] + LAMP[1]) / 2], [(LAMP[2] + LAMP[3]) / 2], HIGH[2]], np.float32) - p
         distance = np.sqrt(_dot(light, light))
         lit = np.maximum(_dot(light, normal) / distance, 0) / (1 + 0.12 * distance * distance)
         low = 1 - 0.35 * np.exp(-p[2] / np.float32(0.15))  # ambient occlusion by the floor

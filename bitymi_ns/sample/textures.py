@@ -39,10 +39,11 @@ def resize(image: Image, height: int, width: int) -> Image:
 def grid(width_m: float, height_m: float) -> tuple[Image, Image]:
     """Compute metric coordinates (x, y), each [h, w], of the texel centres of a surface."""
     sides = [(side, max(2, round(side * TEXELS_PER_METRE))) for side in (width_m, height_m)]
-    return tuple(np.meshgrid(*((np.arange(n, dtype=np.float32) + 0.5) * np.float32(side / n) for side, n in sides)))
+    x, y = np.meshgrid(*((np.arange(n, dtype=np.float32) + 0.5) * np.float32(side / n) for side, n in sides))
+    return x, y
 
 
-def noise(rng: np.random.Generator, shape: tuple[int, int], cells: tuple[int, int], octaves: int = 4) -> Image:
+def noise(rng: np.random.Generator, shape: tuple[int, ...], cells: tuple[int, int], octaves: int = 4) -> Image:
     """Generate fractal value noise [h, w] of about [0, 1]; `cells` are rows and columns of the coarsest octave."""
     total = np.zeros(shape, np.float32)
     for octave in range(octaves):
@@ -98,7 +99,9 @@ def wallpaper(rng: np.random.Generator, width_m: float, height_m: float) -> Imag
     x, y = grid(width_m, height_m)
     stripe = (x / 0.16).astype(int) % 2 == 0
     diamond = np.abs((x % 0.16) - 0.08) + np.abs((y % 0.12) - 0.06) < 0.035
-    color = np.where(stripe[..., None], np.float32([0.30, 0.48, 0.50]), np.float32([0.78, 0.76, 0.64]))
+    color = np.where(
+        stripe[..., None], np.array([0.30, 0.48, 0.50], np.float32), np.array([0.78, 0.76, 0.64], np.float32)
+    )
     color[diamond] = np.where(stripe[diamond, None], (0.92, 0.80, 0.42), (0.55, 0.25, 0.28))
     return (color * (0.9 + 0.2 * noise(rng, x.shape, (30, 60), 3))[..., None]).clip(0, 1)
 
@@ -135,7 +138,7 @@ def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str)
     elif kind == "noise":
         n = noise(rng, x.shape, (4, 5), 6)
         vein = np.abs(np.sin(18 * n + 3 * x))
-        image = mix(mix((0.05, 0.30, 0.28), (0.85, 0.30, 0.20), n), (0.98, 0.93, 0.80), vein**6)
+        image = mix(mix((0.05, 0.30, 0.28), (0.85, 0.30, 0.20), n), (0.98, 0.93, 0.80), np.power(vein, 6))
     else:
         image = rng.random((24, 3), dtype=np.float32)[(x / width_m * 24).astype(int).clip(0, 23)]
         image = np.where(((y / height_m * 10).astype(int) % 2 == 0)[..., None], image, 1 - image)
@@ -160,7 +163,7 @@ def landscape(rng: np.random.Generator) -> Image:
         place = (slice(int(y - r), int(y + r)), slice(max(0, int(x - r)), min(w, int(x + r))))
         yy, xx = np.ogrid[place]
         crown = (xx - x) ** 2 + (yy - y) ** 2 < (r * rng.uniform(0.7, 1.0)) ** 2
-        image[place][crown] = np.float32([0.10, 0.28, 0.10]) * rng.uniform(0.7, 1.5)
+        image[place][crown] = np.array([0.10, 0.28, 0.10], np.float32) * rng.uniform(0.7, 1.5)
     for _ in range(14):
         x, y, s = int(rng.uniform(0, w - 80)), int(rng.uniform(60, 120)), int(rng.uniform(24, 44))
         image[y : y + s, x : x + int(1.4 * s)] = rng.uniform(0.6, 0.95, 3)

@@ -202,7 +202,9 @@ class Scene(nn.Module):
         try:
             image, fragments = draw(projection, self.config.max_fragments)
         except TooManyFragments as error:
-            if descent is not None:  # the backward pass of a band moves texels before another is rendered again
+            if descent is not None and isinstance(
+                self.field, TexelField
+            ):  # the backward pass of a band moves texels before another is rendered again
                 read = self.field.texels.detach().clone()
             image, fragments = draw_in_bands(projection, draw, error, self.config.max_fragments, self.config.rim)
         return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)

@@ -67,7 +67,7 @@ def open_image(path: Path) -> Image.Image:
 def _encode(pixels: Pixels, caption: str) -> Picture:
     """Scale an image [H, W, 3] in [0, 1] down if it is wide, and encode it."""
     image = Image.fromarray((pixels * 255.0).round().astype(np.uint8))
-    image.thumbnail((MAX_WIDTH, image.height), Image.LANCZOS)
+    image.thumbnail((MAX_WIDTH, image.height), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
     image.save(buffer, "JPEG", quality=92, subsampling=0)
     return Picture(caption, buffer.getvalue(), image.width, image.height)

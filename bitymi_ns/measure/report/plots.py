@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
@@ -13,8 +13,13 @@ from bitymi_ns.measure.report.records import Curve, Evaluation
 
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Markers of bundles, one per format."""
-HOLLOW = {"marker": "o", "ms": 7, "markerfacecolor": "white", "markeredgewidth": 1.8}  # of trained scenes
-DASHES = {"linewidth": 0.9, "linestyle": (0, (4, 3))}  # of Pareto fronts
+HOLLOW: dict[str, Any] = {
+    "marker": "o",
+    "ms": 7,
+    "markerfacecolor": "white",
+    "markeredgewidth": 1.8,
+}  # of trained scenes
+DASHES: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 3))}  # of Pareto fronts
 TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
 CURVES = (
     ("PSNR in the course of training", "training seconds", "PSNR (dB)", ("seconds", "psnr")),
@@ -114,7 +119,8 @@ def pareto_panel(
     """Draw quality against cost of one scene: hollow circles for trained scenes, filled markers for bundles, a line per
     method, and the Pareto front of all points."""
     _, up, span = METRICS[key]
-    points = {id(e): (cost.value(e), e.results.get(key)) for e in rows}
+    costs = {id(e): cost.value(e) for e in rows}
+    points = {id(e): (x, e.results[key]) for e in rows if (x := costs[id(e)]) is not None}
     best = front(list(points.values()), up)
     if len(best) > 1:
         axes.step(*zip(*best, strict=True), where="post", color=INK, alpha=0.6, zorder=1, **DASHES)
@@ -140,7 +146,7 @@ def pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: dic
     variants = sorted({_variant(e) for e in drawn if e.baked})
     markers = {variant: MARKERS[i % len(MARKERS)] for i, variant in enumerate(variants)}
     legend = [Line2D([], [], color=colors[m], label=m, linewidth=4) for m in sorted({e.method for e in drawn})]
-    mark = {"color": INK, "linestyle": ""}
+    mark: dict[str, Any] = {"color": INK, "linestyle": ""}
     if any(not e.baked for e in drawn):
         legend.append(Line2D([], [], label="trained", **HOLLOW, **mark))
     names = {variant: f"baked, {variant}" if variant else "baked" for variant in variants}

@@ -162,7 +162,7 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
     alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0) if way.alpha else None
-    projection = ops.project(*geometry_of(leaves), camera, near, alpha=alpha)
+    projection = ops.project(*geometry_of(leaves), camera=camera, near=near, alpha=alpha)
     fragments = ops.trace(projection, way.rim)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
@@ -183,7 +183,7 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
 def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = view_directions(leaves["means"], case.viewmat)
-    colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), directions)
+    colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), dirs=directions)
     geometry = geometry_of(leaves)
     texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]
     tiles = tile_images(torch.cat(texels, 1)) if texels else None
@@ -207,7 +207,7 @@ def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
 def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor, keep: bool = True) -> dict[str, Tensor]:
     """Compute d sum(weights * images over `pixels`) / d leaves, float64 on the CPU."""
     leaves = result.leaves
-    loss = 0.0
+    loss = torch.zeros(())
     for key, image in result.images.items():
         loss = loss + (image * torch.where(pixels[:, None], weights[key], 0.0).to(image)).sum()
     grads = torch.autograd.grad(loss, list(leaves.values()), retain_graph=keep, allow_unused=True)

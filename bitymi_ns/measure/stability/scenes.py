@@ -4,7 +4,6 @@ stiffness."""
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -63,15 +62,17 @@ def random_scene(
     return SceneCase(name, params, viewmat, K, width, height, background)
 
 
-def front_scene(n: int, seed: int, width: int = 24, height: int = 16, **kwargs: Any) -> SceneCase:
+def front_scene(
+    n: int, seed: int, width: int = 24, height: int = 16, scale: float = 0.25, name: str = "random"
+) -> SceneCase:
     """Generate a random scene in front of a camera at the origin, whose frame is the world frame."""
-    case = random_scene(n, seed, width, height, **kwargs)
+    case = random_scene(n, seed, width, height, scale, name)
     case.params["means"] = case.params["means"] @ case.viewmat[:3, :3].T + case.viewmat[:3, 3]
     case.viewmat = torch.eye(4, dtype=torch.float64)
     return case
 
 
-def changed(case: SceneCase, name: str = "", **params: Tensor | float) -> SceneCase:
+def changed(case: SceneCase, name: str = "", /, **params: Tensor | float) -> SceneCase:
     """Copy and rename a case with some parameters replaced; a number fills the whole parameter."""
     new = {key: value.clone() for key, value in case.params.items()}
     for key, value in params.items():

@@ -34,13 +34,14 @@ def _struct(name: str) -> np.dtype:
         offsets[field] = -(-end // alignment) * alignment
         formats.append(np.dtype((f"<{kind}4", (int(rows), width) if array else width if vector else ())))
         end = offsets[field] + formats[-1].itemsize
-    parts = {
-        "names": list(offsets),
-        "formats": formats,
-        "offsets": list(offsets.values()),
-        "itemsize": -(-end // 16) * 16,
-    }
-    return np.dtype(parts)
+    return np.dtype(
+        {
+            "names": list(offsets),
+            "formats": formats,
+            "offsets": list(offsets.values()),
+            "itemsize": -(-end // 16) * 16,
+        }
+    )
 
 
 SURFEL, SEEN, FRAME = _struct("Surfel"), _struct("Seen"), _struct("Frame")

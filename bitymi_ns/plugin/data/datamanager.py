@@ -203,9 +203,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def _budget(self) -> MemoryBudget:
         return MemoryBudget(photograph_bytes(torch.device(self.device), self.world_size))
 
-    def _load_images(  # type: ignore[override]
-        self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]
-    ) -> CachedImages:
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> CachedImages:
         """Cache a split in host memory; a run decides what is on the GPU (`DownscaledViews`)."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         with reporting_input_errors(self.config):
@@ -217,7 +215,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return int(cameras.width[0]) * int(cameras.height[0])
 
     @property
-    def fixed_indices_eval_dataloader(self) -> Sequence[tuple[Cameras, dict[str, Any]]]:  # type: ignore[override]
+    def fixed_indices_eval_dataloader(self) -> Sequence[tuple[Cameras, dict[str, Any]]]:
         """Held-out views in turn, read on demand."""
         return OnDemand(len(self.eval_dataset), self.eval_view)
 

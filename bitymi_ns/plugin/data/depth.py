@@ -70,7 +70,7 @@ def with_depth(
     fit_of = dict(zip(rows, fits, strict=True)) if fits is not None else {}
     fitted = [FittedMaps(files, fit_of.get(i), unit) for i, files in enumerate(maps)]
     metadata = {**outputs.metadata, KEY: dataclasses.replace(facts, fitted=fitted)}
-    used = [(i, each.fitted(fit_of[i])) for i, each in zip(rows, seen, strict=True) if fit_of.get(i) is not None]
+    used = [(i, each.fitted(fit)) for i, each in zip(rows, seen, strict=True) if (fit := fit_of.get(i)) is not None]
     pixels = int((outputs.cameras.width.long() * outputs.cameras.height.long()).sum())
     count = min(MOST_POINTS, pixels // PIXELS_PER_POINT) - len(old) if add_points else 0
     new, rgb = _new_points([each for _, each in used], [outputs.image_filenames[i] for i, _ in used], count)
@@ -130,7 +130,7 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
     return np.stack([x * z, y * z, z], -1) @ view.rotation.T + view.center
 
 
-def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> list[DepthFit | None] | None:
+def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> Sequence[DepthFit | None] | None:
     """Fit each map to points [N, 3]; with too few, take it as metric, with `unit` scene units per metre. None = depth
     is unused."""
     if not any(each.values.any() for each in seen):
@@ -272,7 +272,8 @@ def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tup
         return xyz[kept], np.asarray(image).reshape(-1, 3)[draws[i][kept]], 1.0 / (1.0 + agree[kept])
 
     parts = in_threads(of_view, range(len(seen)))
-    xyz, rgb, weight = (np.concatenate([part[k] for part in parts]) for k in range(3))
+    xyz, rgb = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
+    weight = np.concatenate([part[2] for part in parts])
     if len(xyz) <= count:
         return xyz, rgb
     order = np.sort(np.argsort(rng.exponential(size=len(xyz)) / weight, kind="stable")[:count])

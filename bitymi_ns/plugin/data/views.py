@@ -67,7 +67,7 @@ def make_views(
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * capture.applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
-    masks = [photographs[i].mask for i in of]
+    masks: list[Any] = [photographs[i].mask for i in of]  # some may have none
     side = frame.scene_scale
     views = Views(
         image_filenames=names,
@@ -75,7 +75,7 @@ def make_views(
         alpha_color=alpha_color,
         metadata=metadata,
         scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
-        mask_filenames=masks if any(masks) else None,  # type: ignore[arg-type]  # some may have none
+        mask_filenames=masks if any(masks) else None,
         dataparser_scale=scale * capture.applied_scale,
         dataparser_transform=torch.from_numpy(transform if capture.applied is None else transform @ capture.applied),
     )
@@ -131,9 +131,10 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
     def column(name: str, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         return torch.tensor([getattr(pinhole, name) for pinhole in pinholes], dtype=dtype)
 
+    columns: dict[str, Any] = {name: column(name) for name in ("fx", "fy", "cx", "cy")}
+    columns |= {name: column(name, torch.int32) for name in ("width", "height")}
     return Cameras(
-        **{name: column(name) for name in ("fx", "fy", "cx", "cy")},
-        **{name: column(name, torch.int32) for name in ("width", "height")},
+        **columns,
         camera_to_worlds=poses[:, :3, :4],
         camera_type=CameraType.PERSPECTIVE,
     )

@@ -7,9 +7,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.markup import escape
 from rich.table import Table
 
+from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, Manifest
 from bitymi_ns.bundle.read import download_bytes
-from bitymi_ns.bundle.statistics import FineTuning
+from bitymi_ns.bundle.statistics import FineTuning, KeptSurfels, KeptTexels
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.plugin.console import say
@@ -23,23 +24,23 @@ def decibels(value: float | None) -> str:
 
 def print_summary(folder: Path, info: Manifest) -> None:
     statistics = info.statistics
-    surfels = statistics.surfels
+    surfels = statistics.surfels or KeptSurfels()
     table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
     table.add_row("Surfels", f"{surfels.trained:,} -> {info.surfels.count:,}")
-    left_out = {name: count for name, count in surfels.left_out if count}
+    left_out = {name: count for name, count in surfels.left_out or () if count}
     table.add_row("Left out", ", ".join(f"{v:,} {k.replace('_', ' ')}" for k, v in left_out.items()) or "nothing")
     if statistics.texels is not None:
         print_savings(table, info)
     print_view_color(table, info)
     atlas = statistics.atlas
-    if atlas is None:
+    if atlas is None or atlas.pages is None or info.atlas is None:
         why = "the scene has no texture" if statistics.texels is None else "no tile is needed"
         table.add_row("Atlas", f"none ({why})")
     else:
         layers, height, width = atlas.pages
         size = info.files[info.atlas.file].bytes
         table.add_row("Atlas", f"{size / 1e6:.2f} MB {info.atlas.format}, {layers} x {width} x {height} texels")
-        table.add_row("Occupancy", f"{100 * atlas.occupancy:.1f} %")
+        table.add_row("Occupancy", f"{100 * (atlas.occupancy or 0.0):.1f} %")
         if atlas.psnr is not None:
             table.add_row("Quantisation", f"{atlas.psnr:.2f} dB over the texels")
     for name, learned in (("Polish", statistics.polish), ("Fine-tuning", statistics.finetune)):
@@ -68,10 +69,10 @@ def print_summary(folder: Path, info: Manifest) -> None:
 
 def print_savings(table: Table, info: Manifest) -> None:
     """Add rows for tiles, texels, atlas bytes (by rule, in the bundle) and coding error."""
-    statistics, options = info.statistics, info.statistics.options
-    texels = statistics.texels
-    kept, count = texels.kept, info.surfels.count
-    table.add_row("Tiles", f"{statistics.surfels.trained:,} -> {count - statistics.surfels.without_tile:,}")
+    statistics, options = info.statistics, info.statistics.options or BakeOptions()
+    texels, surfels = statistics.texels or KeptTexels(), statistics.surfels or KeptSurfels()
+    kept, count = texels.kept or 0, info.surfels.count
+    table.add_row("Tiles", f"{surfels.trained:,} -> {count - (surfels.without_tile or 0):,}")
     if texels.paper is not None:
         table.add_row("Texels by the paper's rule", f"{texels.paper:,}")
         voxel = "local voxel" if options.local_voxel else "smallest voxel"
@@ -83,9 +84,9 @@ def print_savings(table: Table, info: Manifest) -> None:
         table.add_row("... only where they are seen", f"{texels.within_visible_part:,}")
     if texels.polished is not None:
         table.add_row("... by the pixels that show them: polished", f"{texels.polished:,}")
-    first = texels.paper or texels.learned or texels.within_visible_part
+    first = texels.paper or texels.learned or texels.within_visible_part or 0
     table.add_row("... within the tolerance: kept", f"{kept:,} ({100 * kept / max(1, first):.1f} %)")
-    rule = first * BYTES_PER_TEXEL["bc7" if info.surfels.columns else options.format]
+    rule = first * BYTES_PER_TEXEL["bc7" if info.surfels.columns else options.format or "bc7"]
     stored = info.files[info.atlas.file].bytes if info.atlas else 0
     table.add_row("Atlas bytes", f"{rule:,} -> {stored:,} ({100 * stored / max(1, rule):.1f} %)")
     certificate = statistics.certificate
@@ -103,11 +104,12 @@ def print_view_color(table: Table, info: Manifest) -> None:
         table.add_row("Surfel bytes", f"{stored:,}")
         return
     sites, count, error = lean.sites, info.surfels.count, lean.error
-    share = 100 * sites.after / sites.before
-    table.add_row(VIEW_COLORS[lean.kind].kept, f"{sites.before:,} -> {sites.after:,} ({share:.1f} %)")
+    share = 100 * sites.after / (sites.before or 1)
+    kept = VIEW_COLORS[lean.kind or info.surfels.view_color].kept
+    table.add_row(kept, f"{sites.before:,} -> {sites.after:,} ({share:.1f} %)")
     table.add_row("Surfels of one colour", f"{lean.one_color:,} ({100 * lean.one_color / count:.1f} %)")
-    if info.surfels.columns is None:
-        whole = stored + lean.bytes.before - lean.bytes.after
+    if info.surfels.columns is None and lean.bytes is not None:
+        whole = stored + (lean.bytes.before or 0) - lean.bytes.after
         table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
     else:
         table.add_row("Surfel bytes", f"{stored:,} ({stored / max(1, count):.1f} per surfel)")
@@ -122,9 +124,9 @@ def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:
         table.add_row(name, f"none: {tuned.views} training views are too few for validation views")
         return
     table.add_row(name, f"{tuned.steps} steps, {tuned.seconds:.0f} s")
-    if tuned.steps < tuned.steps_asked:
+    if tuned.steps < (tuned.steps_asked or 0):
         table.add_row("", f"(stopped early at step {tuned.steps} of {tuned.steps_asked}: no gain on the")
-        table.add_row("", f"validation views for {tuned.steps - tuned.best_step} steps)")
+        table.add_row("", f"validation views for {tuned.steps - (tuned.best_step or 0)} steps)")
     gains = {"... validation views": tuned.psnr_held_in, "... held-out views": tuned.psnr_held_out}
     for views, gain in gains.items():
         if gain is not None:

@@ -57,7 +57,8 @@ def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> byt
     """Make the config.yml with which nerfstudio's tools open a bundle. bundle.json does not cover it, as its data path
     may have to be edited for moved photographs."""
     config = copy.deepcopy(config)
-    config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=tuple(background))  # type: ignore[arg-type]
+    red, green, blue = background
+    config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=(red, green, blue))
     config.load_dir = config.load_step = config.load_checkpoint = config.load_config = None
     config.optimizers = {}
     vars(config).pop("read_from", None)
@@ -67,7 +68,7 @@ def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> byt
 def config_without_run(folder: Path, info: Manifest) -> bytes:
     """Make the config.yml of a bundle without run, which uses its own cameras; `BITYMI_DATA` names a capture, which is
     read in the frame of its files if that is the bundle's."""
-    config = method_config("bitymi").config
+    config: Any = method_config("bitymi").config
     config.experiment_name = folder.name
     config.pipeline.datamanager.data = folder.absolute() / "photographs"
     if info.world is None or (np.array_equal(info.world.transform, np.eye(4)[:3]) and info.world.scale == 1):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.data.views import DATA
 from bitymi_ns.plugin.run.device import kernel_device
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig, box_of
-from bitymi_ns.scene.baked import FAST, BakedOutput
+from bitymi_ns.scene.baked import FAST
 from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.crop import Box
@@ -99,7 +99,7 @@ class BakedModel(SurfelModel):
             drawn = self._renderer.render(camera.to(self.device), background.to(self.device), maps)
         if not self._renderer.scene.through_webgpu:
             return drawn
-        return BakedOutput(**{name: None if t is None else t.to(self.device) for name, t in vars(drawn).items()})
+        return replace(drawn, **{name: t.to(self.device) for name, t in vars(drawn).items() if t is not None})
 
     @property
     def background(self) -> Tensor:

@@ -47,11 +47,12 @@ class TrainingRun:
     """
 
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
-        trainer, pipeline = attributes.trainer, attributes.pipeline
+        trainer: Any = attributes.trainer  # nerfstudio declares those of every method
+        pipeline: Any = attributes.pipeline
         assert trainer is not None and pipeline is not None and attributes.optimizers is not None
         self.scene, self.config, self._curve_views = model.scene, model.train_config, model.config.curve_views
         scene, config, curve_points = self.scene, self.config, model.config.curve_points
-        self.datamanager = pipeline.datamanager
+        self.datamanager: Any = pipeline.datamanager
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = attributes.optimizers.parameters

@@ -9,7 +9,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 from io import BytesIO
 from typing import Any, BinaryIO
-from zipfile import ZipFile
+from zipfile import ZipExtFile, ZipFile
 
 import numpy as np
 import torch
@@ -59,6 +59,9 @@ class _Opcodes(dict[int, Callable[[Any], None]]):
 class _Reader(pickle._Unpickler):
     """The unpickler in Python, as the one in C allocates by numbers of the file, and lets it set any attribute."""
 
+    stack: list[Any]
+    pop_mark: Callable[[], list[Any]]
+
     dispatch = _Opcodes((ord(code), pickle._Unpickler.dispatch[ord(code)]) for code in _CODES)
 
     def __init__(self, archive: ZipFile, root: str) -> None:
@@ -80,7 +83,8 @@ class _Reader(pickle._Unpickler):
             part = self._archive.getinfo(f"{self._root}/data/{key}")
             self._storages[key] = torch.empty(part.file_size, dtype=torch.uint8)
             with self._archive.open(part) as file:
-                file.readinto(self._storages[key].numpy())
+                assert isinstance(file, ZipExtFile)
+                file.readinto(self._storages[key].numpy().data)
         raw = self._storages[key]
         if len(raw) != count * dtype.itemsize or (dtype == torch.bool and bool((raw > 1).any())):
             raise ValueError(f"{key} does not hold {count} numbers of {dtype}")

@@ -272,12 +272,14 @@ def _check_run(run: Entry, rows: int, step: int) -> None:
         run[name].number(0.0, 1e12)
     if (capture := run.get("capture")) is not None:
         capture["views"].count()
-        capture["names"].text(), capture["poses"].text()
+        capture["names"].text()
+        capture["poses"].text()
     if (poses := run.get("poses")) is not None and (motions := poses.get("motions")) is not None:
         if not bool((motions.tensor(None, 6, dtype=torch.float64).abs() <= LARGEST).all()):
             motions.refuse("finite")
     if (exposure := run.get("exposure")) is not None:
-        exposure["kind"].text(), exposure["finding"].text()
+        exposure["kind"].text()
+        exposure["finding"].text()
         if not isinstance(exposure["decided"].value, bool):
             exposure["decided"].refuse("true or false")
         if (table := exposure.get("table")) is not None:

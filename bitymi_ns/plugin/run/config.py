@@ -5,7 +5,7 @@ import os
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 import tyro
@@ -59,6 +59,9 @@ class BitymiTrainerConfig(TrainerConfig):
     prompt: tyro.conf.Suppress[str | None] = None  # Of nerfstudio's text-to-scene methods.
     optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
     """By parameter group; the rates come from --pipeline.model.train.lr."""
+
+    if TYPE_CHECKING:  # nerfstudio declares those of every method
+        pipeline: Any = None
 
     def __post_init__(self) -> None:
         """Refuse a command line with two captures: nerfstudio silently uses the first."""
@@ -195,7 +198,7 @@ class BitymiTrainerConfig(TrainerConfig):
             datamanager.data = getattr(datamanager.dataparser, "data", None)
         for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
             path = getattr(owner, "data", None)
-            if path is not None:
+            if owner is not None and path is not None:
                 owner.data = Path(os.path.expanduser(path)).absolute()
         if isinstance(datamanager.dataparser, BitymiDataParserConfig):
             datamanager.dataparser.resolve_names()

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import IO, Any
 
 import numpy as np
@@ -107,7 +107,7 @@ def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
     file.write(encoded.getbuffer())
 
 
-class WholeText(type(Path())):  # type: ignore[misc]
+class WholeText(PosixPath):
     """A path for ns-eval that writes text whole or not at all."""
 
     def write_text(self, data: str, encoding: str | None = None, *options: Any) -> int:
@@ -116,7 +116,7 @@ class WholeText(type(Path())):  # type: ignore[misc]
 
 
 @contextmanager
-def open_gzip(path: Path, mode: str) -> Iterator[IO[bytes]]:
+def open_gzip(path: Path, mode: str) -> Iterator[gzip.GzipFile]:
     """Open a compressed file for writing, whole or not at all, as gzip's function does."""
     with complete_file(Path(path)) as file, gzip.GzipFile(fileobj=file, mode="wb", mtime=0) as compressed:
-        yield compressed  # type: ignore[misc]
+        yield compressed

@@ -64,7 +64,7 @@ def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> i
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
         geometry = (value.cpu() for value in geometry_of(p))
-        most = max(most, count(project(*geometry, camera, scene.near)))
+        most = max(most, count(project(*geometry, camera=camera, near=scene.near)))
     device = p["means"].device
     capacity = int(free_memory(device)) // PER_CARD_FRAGMENT if device.type == "cuda" else MOST
     return min(int(MARGIN * most), bound or capacity)

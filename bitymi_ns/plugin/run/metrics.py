@@ -43,8 +43,9 @@ def _similarity(image: Tensor, reference: Tensor, mask: Tensor | None, distances
     """Measure psnr, ssim, and available distances (names of `LPIPS`)."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
-    pair = [x.permute(2, 0, 1)[None] for x in (image, reference)]
-    ssim = float(structural_similarity_index_measure(*pair, data_range=1.0))
+    first, second = (x.permute(2, 0, 1)[None] for x in (image, reference))
+    ssim = structural_similarity_index_measure(first, second, data_range=1.0)
+    ssim = float(ssim[0] if isinstance(ssim, tuple) else ssim)
     return {"psnr": psnr(image, reference, mask), "ssim": ssim, **lpips_metrics(image, reference, distances)}
 
 

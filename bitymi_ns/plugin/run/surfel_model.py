@@ -7,6 +7,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import torch
@@ -73,7 +74,7 @@ class SurfelModel(Model):
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
         """Move the model, except to a device without kernels here, as nerfstudio's tools use any GPU."""
-        device, dtype, _, _ = torch._C._nn._parse_to(*args, **kwargs)
+        device, dtype, _, _ = attrgetter("_nn._parse_to")(torch._C)(*args, **kwargs)
         if dtype is not None:
             raise ValueError("the scene is float32")
         return self if device is None else super().to(kernel_device(device))
@@ -133,15 +134,16 @@ class SurfelModel(Model):
         height, width = rgb.shape[:2]
         target, mask = self.photograph(batch, rgb)
         camera = getattr(self, "_last_camera", None)
-        drawn_here = camera is not None and (camera.width, camera.height) == (width, height)
-        if drawn_here and self.corrections:
+        if camera is not None and (camera.width, camera.height) != (width, height):
+            camera = None  # drawn elsewhere
+        if camera is not None and self.corrections:
             rgb, drawn = self._exposed(camera), rgb
             metrics = image_metrics(rgb, target, mask, drawn)
         else:
             metrics = image_metrics(rgb, target, mask)
         metrics["fragments_per_pixel"] = float(outputs["overdraw"].mean()) * OVERDRAW_SCALE
         metrics.update(self.sizes())
-        if self.measure_time and drawn_here:
+        if self.measure_time and camera is not None:
             draw = partial(self.render, camera, self.background, maps=False)
             metrics["render_ms"] = render_milliseconds(draw, self.device)
         return metrics, {"img": torch.cat([target, rgb], dim=1)}

@@ -14,7 +14,7 @@ import sys
 import tempfile
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import torch
 import torch.distributed as dist
@@ -100,11 +100,12 @@ def work() -> None:
         raise
 
 
-def join(config: TrainerConfig) -> None:
+def join(config: Any) -> None:
     """Join torch.distributed's default group: gloo for CPU tensors, nccl for CUDA tensors. The other processes take the
     configuration of the first. Raises InputError: another process has ended."""
     try:
         with raise_process_lost():
+            store: Any
             store, rank, count = next(dist.rendezvous("env://", timeout=SETUP))
             if rank == 0:
                 store.set(CONFIG, pickle.dumps(config))

@@ -71,6 +71,9 @@ class BitymiTrainer(Trainer):
     """Trainer to a total number of steps, so that interrupted and resumed runs end like uninterrupted ones. Every
     process of a run has one; they train in step."""
 
+    config: Any  # nerfstudio declares those of every method
+    pipeline: Any
+
     def __init__(self, config: TrainerConfig, **alone: Any) -> None:
         here = torchrun.own("LOCAL_")  # nerfstudio did not start the process and passes rank 0 of 1
         with print_brackets():
@@ -216,6 +219,9 @@ class BitymiTrainer(Trainer):
 
 class BitymiPipeline(VanillaPipeline):
     """nerfstudio's pair of data manager and model."""
+
+    datamanager: Any  # nerfstudio declares those of every method
+    model: Any
 
     def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
         # without `world_size`, for which nerfstudio would wrap the model in DistributedDataParallel (`torchrun`)

@@ -151,8 +151,8 @@ def rasterize(
     projection = project(*geometry_of(surfels), camera=camera, near=near)
     base = colors - COLOR_BIAS
     if not maps and can_rasterize(means.device):
-        image, marks = rasterize_image(projection, base)
-        return RenderOutput.of_image(image, projection, marks, background, maps)
+        image, fragments = rasterize_image(projection, base)
+        return RenderOutput.of_image(image, projection, fragments, background, maps)
 
     def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
         fragments = trace(part, most=most)

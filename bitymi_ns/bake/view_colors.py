@@ -123,9 +123,9 @@ def color_choices(
     for at in view_directions(means, squares > 0, centers):
         own = [surfels[name][at.rows] for name in entry.names]
         shown = squares[:, at.rows].float()
-        blind, of_blind = _blind(means[at.rows], shown, centers, near)
-        weight = torch.cat([_weights(at, shown), of_blind], dim=1)
-        at = replace(at, unit=torch.cat([at.unit, blind], dim=1), valid=F.pad(at.valid, (0, blind.shape[1])))
+        unseen, of_unseen = _unseen(means[at.rows], shown, centers, near)
+        weight = torch.cat([_weights(at, shown), of_unseen], dim=1)
+        at = replace(at, unit=torch.cat([at.unit, unseen], dim=1), valid=F.pad(at.valid, (0, unseen.shape[1])))
         target = shown_at(kind, dict(zip(entry.names, own, strict=True)), at.unit)
 
         def rest_of(rows: Tensor, base: Tensor, terms: Tensor, shown: Tensor) -> Tensor:
@@ -174,7 +174,7 @@ def _weights(at: Directions, weights: Tensor) -> Tensor:
     return torch.cat([VIEW_SHARE * of_views, between.expand(-1, rest)], dim=1)
 
 
-def _blind(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
+def _unseen(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
     """Find the directions [n, BLIND, 3] from the nearest views that do not show a surfel, and their weights [n, BLIND]:
     a share of the mean weight of the views that show it, scaled by the inverse square of the distance; 0 where there is
     no such view. `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""

@@ -53,8 +53,8 @@ def machine() -> str:
     """Describe the machine in one line: processor, cores, memory, GPUs, and the limit on threads."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     memory = psutil.virtual_memory().total / 2**30
-    cards = output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
-    gpus = f", {len(cards)} x {cards[0]}" if cards else ""
+    names = output(["nvidia-smi", "--query-gpu=name", "--format=csv,noheader"]).splitlines()
+    gpus = f", {len(names)} x {names[0]}" if names else ""
     threads = os.environ.get("OMP_NUM_THREADS")
     limit = f", OMP_NUM_THREADS={threads}" if threads else ""
     return f"{processor()}, {cores} cores, {memory:.0f} GiB{gpus}{limit}"

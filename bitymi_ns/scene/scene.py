@@ -187,8 +187,8 @@ class Scene(nn.Module):
         texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode, descent)
         base = self.base_color(projection)
         if texture is not None:
-            image, marks = rasterize_image(projection, base, **texture, rim=self.config.rim)
-            return RenderOutput.of_image(image, projection, marks, background, maps)
+            image, fragments = rasterize_image(projection, base, **texture, rim=self.config.rim)
+            return RenderOutput.of_image(image, projection, fragments, background, maps)
         read: Tensor | None = None
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:

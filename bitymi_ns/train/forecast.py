@@ -63,7 +63,7 @@ class Forecast:
         surfels: Steps,
         evaluated: Mapping[int, int],
         first: int = 0,
-        card: bool = False,
+        on_gpu: bool = False,
     ) -> None:
         """
         Args:
@@ -72,10 +72,10 @@ class Forecast:
             surfels: in each step (`expected_surfels`).
             evaluated: number of views evaluated after a step, by step.
             first: step with which the run begins, or goes on.
-            card: the run is on a card, where small pictures take as long as large ones.
+            on_gpu: the run is on a GPU, where small pictures take as long as large ones.
         """
         steps = schedule.max_steps
-        sizes = np.array([1.0 if card else schedule.resolution_factor(step) for step in range(steps)])
+        sizes = np.array([1.0 if on_gpu else schedule.resolution_factor(step) for step in range(steps)])
         of_step = np.where(np.arange(steps) >= schedule.texels_start, TEXELS, 1.0)
         at_full_size = np.zeros(steps)
         of_step[list(schedule.densify_steps)] += DRAWN * min(views, schedule.config.densify.views)

@@ -14,7 +14,7 @@ SHARE = 0.75
 next view, and other programs have the rest."""
 PER_SURFEL = 3000  # bytes: parameters, gradients, Adam's averages, two states to go back to, copies of a densification
 PER_TEXEL = 44  # bytes: colour, alpha and its gradient, share, and two states with colours in half precision
-PER_TEXEL_SUM = 12  # bytes more on a card: the gradient of colours, which the CPU adds tile by tile
+PER_TEXEL_SUM = 12  # bytes more on a GPU: the gradient of colours, which the CPU adds tile by tile
 PER_PIXEL = 400  # bytes of a view: pictures, gradients and maps, and the ten views of multi-view scores
 PER_FRAGMENT = 36  # bytes: list, gradients of weights and coordinates, order of the backward pass
 FRAGMENTS = 45  # fragments per pixel of a view; 28 to 45 were measured

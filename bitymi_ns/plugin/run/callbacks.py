@@ -106,8 +106,8 @@ class TrainingRun:
         held_out = len(self.datamanager.eval_dataset)
         at_once = min(held_out, self._curve_views or held_out)
         evaluated = {step: held_out if step + 1 >= self.total else at_once for step in self.curve_steps}
-        card, mean = self.scene.surfels["means"].is_cuda, sum(pixels) / len(pixels)
-        return Forecast(self.training.schedule, len(pixels), mean, surfels, evaluated, self.first_step, card)
+        on_gpu, mean = self.scene.surfels["means"].is_cuda, sum(pixels) / len(pixels)
+        return Forecast(self.training.schedule, len(pixels), mean, surfels, evaluated, self.first_step, on_gpu)
 
     def _compare_sizes(self, step: int) -> None:
         """Measure for the forecast what a step takes at the sizes of pictures that are to come."""
@@ -140,15 +140,15 @@ class TrainingRun:
         """Stop, or warn, if views see nothing of what training starts from: they would give no gradient."""
         dataset = self.datamanager.train_dataset
         cameras = [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
-        blind = [dataset.image_filenames[i] for i in views_without_surfels(self.scene, cameras)]
-        if len(blind) == len(dataset):
+        empty = [dataset.image_filenames[i] for i in views_without_surfels(self.scene, cameras)]
+        if len(empty) == len(dataset):
             fail(
                 f"none of the {len(self.scene):,} points that training starts from lies in any training view: "
                 "nothing could be learned. Either the point cloud is in another frame than the poses, or the cameras "
                 "look the other way (nerfstudio's axes are x right, y up, z back)."
             )
-        if blind:
-            none = f"{listed(blind)} sees none of the points that training starts from"
+        if empty:
+            none = f"{listed(empty)} sees none of the points that training starts from"
             warn(f"{none}: the pose may be wrong, or the point cloud has no points there.")
 
     def callbacks(self) -> list[TrainingCallback]:

@@ -91,8 +91,8 @@ class BitymiTrainerConfig(TrainerConfig):
         if not 0 <= self.machine.seed < SEEDS:
             fail(f"--machine.seed must be from 0 to {SEEDS - 1}, not {self.machine.seed}")
         if several := torchrun.own().count > 1:
-            machines, cards = torchrun.own("GROUP_").count, torchrun.own("LOCAL_").count
-            self.machine = replace(self.machine, num_machines=machines, num_devices=cards)
+            machines, gpus = torchrun.own("GROUP_").count, torchrun.own("LOCAL_").count
+            self.machine = replace(self.machine, num_machines=machines, num_devices=gpus)
         self._check_options()
         if not several and (self.machine.num_machines, self.machine.num_devices) != (1, 1):
             torchrun.run(self)
@@ -132,9 +132,9 @@ class BitymiTrainerConfig(TrainerConfig):
             if steps < 1 or group not in PARAMETER_GROUPS:
                 known = ", ".join(PARAMETER_GROUPS)
                 fail(f"--gradient-accumulation-steps {group} {steps}: give at least 1 for one of {known}")
-        asked, cards = self.machine.num_devices, torch.cuda.device_count()
-        if self.machine.device_type == "cuda" and has_cuda_kernels() and asked > cards:
-            fail(f"there are {cards} of {asked} GPUs that --machine.num-devices asks for")
+        asked, gpus = self.machine.num_devices, torch.cuda.device_count()
+        if self.machine.device_type == "cuda" and has_cuda_kernels() and asked > gpus:
+            fail(f"there are {gpus} of {asked} GPUs that --machine.num-devices asks for")
 
     def print_to_terminal(self) -> None:
         """Print nothing: nerfstudio prints every option before checks; `save_config` reports what matters."""

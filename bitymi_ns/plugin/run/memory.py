@@ -1,6 +1,6 @@
 """Estimate memory of training or an export on its device before the start: by fragments of a few views
 (docs/training.md, Memory), and numbers measured with the default preset on the CPU, or counted from arrays on a
-card."""
+GPU."""
 
 from collections.abc import Sequence
 
@@ -44,10 +44,10 @@ KEPT_LISTS = 2
 MOST_KEPT = 2.8e6  # pixels of a picture whose colours are such a block; those of larger ones are returned
 PER_SHADED_FRAGMENT = 60
 """Further bytes with a hash-grid field: surfels and pixels of fragments, points, residuals and their gradients."""
-PER_CARD_FRAGMENT = 4 * NUMBERS  # bytes on a card in lists of training
-PER_PASSING_FRAGMENT = 36  # bytes on a card in temporary lists, for the coverage of texels; pictures need no list
+PER_GPU_FRAGMENT = 4 * NUMBERS  # bytes on a GPU in lists of training
+PER_PASSING_FRAGMENT = 36  # bytes on a GPU in temporary lists, for the coverage of texels; pictures need no list
 PER_BAKED_FRAGMENT = 48
-"""Bytes on a card in the fine-tuning of an export: 28 of the list, 1 + 36 of the part that shows texels, at most 43 %
+"""Bytes on a GPU in the fine-tuning of an export: 28 of the list, 1 + 36 of the part that shows texels, at most 43 %
 as measured, and 3 of the pairs of surfel and tile, with about thirty fragments each."""
 PER_BAKED_TEXEL = 96  # bytes in an export: eight copies, as learned, listed, tuned, and in pages
 PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
@@ -59,14 +59,14 @@ SPREAD = 1.3  # factor of the stated figures to either side of the estimate
 @torch.no_grad()
 def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
     """Estimate the most fragments at once of any of these views, by a count of a few; views with more than `bound` are
-    drawn in bands (0 = that of the CPU kernels, or of a card's memory)."""
+    drawn in bands (0 = that of the CPU kernels, or of a GPU's memory)."""
     p, most = scene.surfels, 0
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
         geometry = (value.cpu() for value in geometry_of(p))
         most = max(most, count(project(*geometry, camera=camera, near=scene.near)))
     device = p["means"].device
-    capacity = int(free_memory(device)) // PER_CARD_FRAGMENT if device.type == "cuda" else MOST
+    capacity = int(free_memory(device)) // PER_GPU_FRAGMENT if device.type == "cuda" else MOST
     return min(int(MARGIN * most), bound or capacity)
 
 
@@ -81,34 +81,34 @@ def state_training(
 ) -> None:
     """Print the memory estimate of a training run, from its `scene` at the start, the cameras of its views, on the CPU,
     and the expected largest number of surfels. `texels`: options of those that learn (None = none), from `to_come`
-    renders. `processes`: of equal need on this machine. `lists`: losses need lists of fragments on a card, too."""
+    renders. `processes`: of equal need on this machine. `lists`: losses need lists of fragments on a GPU, too."""
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
-    card = device.type == "cuda"
+    on_gpu = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
-    if card:
+    if on_gpu:
         lists = lists or scene.config.max_fragments > 0 or not can_rasterize(device)
         kept = min(photograph_budget(device), 9 * total)
     else:
         kept = PROGRAM + min(PHOTOGRAPH_BYTES, 3 * total) + min(DOWNSCALED_BYTES, 3 * total)  # at half size
     view = PER_PIXEL * pixels
-    view += _per_fragment(scene, PER_CARD_FRAGMENT if lists else PER_PASSING_FRAGMENT) * fragments
+    view += _per_fragment(scene, PER_GPU_FRAGMENT if lists else PER_PASSING_FRAGMENT) * fragments
     freed = max(FREED, KEPT_LISTS * PER_PIXEL * min(pixels, MOST_KEPT))
-    needed = kept + view + (0 if card else min(KEPT_LISTS * view, freed))
+    needed = kept + view + (0 if on_gpu else min(KEPT_LISTS * view, freed))
     surfels = max(len(scene), most_surfels)
     grown = PER_SURFEL * surfels
     if texels is not None:  # they begin after the error prune
         most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
         most = max(most, SMALLEST**2 * KEPT * surfels)
-        grown = max(grown, KEPT * grown + (PER_TEXEL + card * PER_TEXEL_SUM) * most)
+        grown = max(grown, KEPT * grown + (PER_TEXEL + on_gpu * PER_TEXEL_SUM) * most)
         grown += len(cameras) * KEPT * surfels  # of `Visibility`, at most a byte for each surfel and view
     needed += grown
-    if card:  # a bound on fragments would bring lists, which take more memory
+    if on_gpu:  # a bound on fragments would bring lists, which take more memory
         fewer = f"train fewer surfels (--max-surfels {max(1, int(surfels / 2))})"
         advice = f"{fewer} or smaller photographs (--downscale-factor 2)"
     else:
         option = f"--pipeline.model.scene.max-fragments {max(1, fragments // 4)}"
         advice = f"draw large views in smaller parts, which takes longer: {option}"
-    needed *= 1 if card else processes
+    needed *= 1 if on_gpu else processes
     _state("Training", (needed / SPREAD, needed * SPREAD), cameras, advice, device)
 
 
@@ -137,10 +137,10 @@ def state_export(
     _state("The export", (needed, needed), cameras, "export with --finetune-memory 0, which takes longer", device)
 
 
-def _per_fragment(scene: Scene, of_card: float) -> float:
-    """Return the bytes per fragment; on a card `of_card`, or those of a list if a hash-grid field shades."""
+def _per_fragment(scene: Scene, of_gpu: float) -> float:
+    """Return the bytes per fragment; on a GPU `of_gpu`, or those of a list if a hash-grid field shades."""
     if scene.surfels["means"].device.type == "cuda":
-        return PER_CARD_FRAGMENT if scene.config.texture == "hash" else of_card
+        return PER_GPU_FRAGMENT if scene.config.texture == "hash" else of_gpu
     return PER_FRAGMENT + PER_SHADED_FRAGMENT * (scene.config.texture == "hash")
 
 
@@ -153,17 +153,17 @@ def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
 def _state(
     what: str, needed: tuple[float, float], cameras: Sequence[Camera], advice: str, device: torch.device
 ) -> None:
-    """Print the need, from low to high, and a warning if the machine or card has less."""
+    """Print the need, from low to high, and a warning if the machine or GPU has less."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"
-    card = device.type == "cuda"
-    memory, where = ("memory of the card", "the card") if card else ("memory", "this machine")
+    on_gpu = device.type == "cuda"
+    memory, where = ("memory of the GPU", "the GPU") if on_gpu else ("memory", "this machine")
     (low, high), numbers = needed, "about {:.1f}"
     if low < high:
         numbers = "{:.2f} to {:.2f}"
     say(f"{what} will take {numbers.format(low / 1e9, high / 1e9)} GB of {memory} for {photographs}.")
-    available = free_memory(device) if card else available_memory(psutil.Process().memory_info().rss)
+    available = free_memory(device) if on_gpu else available_memory(psutil.Process().memory_info().rss)
     there = f"the {available / 1e9:.1f} GB that {where} has available"
     if low > available:
         warn(f"That is more than {there}. Close other programs, or {advice}.")

@@ -96,8 +96,8 @@ def test_a_card_is_compared_with_its_own_memory(
         monkeypatch.setattr(memory, "free_memory", lambda device, free=free: free)
         state(OnCard(scene[0]), [scene[1]] * 20, 0)  # type: ignore[operator]
         text = said(capsys)
-        assert "GB of memory of the card for 20 training photographs" in text
-        assert ("more than the 1.0 GB that the card has available" in text) == (free == 10**9)
+        assert "GB of memory of the GPU for 20 training photographs" in text
+        assert ("more than the 1.0 GB that the GPU has available" in text) == (free == 10**9)
         needed.append(gigabytes(text))
     assert needed[0] > 1 and needed[1] <= needed[0]  # views with more fragments than fit are drawn in bands
 
@@ -107,7 +107,7 @@ def test_lists_that_training_makes_on_a_card_count(
 ) -> None:
     monkeypatch.setattr(memory, "photograph_budget", lambda device: 0)
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**12)
-    monkeypatch.setattr(memory, "PER_CARD_FRAGMENT", 10**7)
+    monkeypatch.setattr(memory, "PER_GPU_FRAGMENT", 10**7)
     count = memory.most_fragments(scene[0], [scene[1]])
 
     def gigabytes_of(config: SceneConfig, lists: bool = False) -> float:

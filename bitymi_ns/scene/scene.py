@@ -152,6 +152,9 @@ class Scene(nn.Module):
         center = projection.camera.exact_center
         return view_color(self.config.view_color, self.surfels, means, center, projection.visible)
 
+    def _surfels_with(self, opacity_logits: Tensor | None) -> Mapping[str, Tensor]:
+        return self.surfels if opacity_logits is None else {**self.surfels, "opacity_logits": opacity_logits}
+
     @memory_errors()
     def render(
         self,
@@ -161,6 +164,7 @@ class Scene(nn.Module):
         maps: bool = False,
         overdraw_half: float | None = None,
         descent: TexelDescent | None = None,
+        opacity_logits: Tensor | None = None,
     ) -> RenderOutput:
         """Render a view: visibility, then shading, then compositing.
 
@@ -173,12 +177,13 @@ class Scene(nn.Module):
             maps: also render depth and normals.
             overdraw_half: also render the soft overdraw, see `ops.soft_overdraw`; None: no.
             descent: update of the texels of a `TexelField` by the backward pass; None: they get a gradient.
+            opacity_logits: [N] instead of the surfels' own; None: these.
 
         Raises:
             TooManyFragments: a single row of screen tiles has too many.
             MemoryError: the picture does not fit into memory.
         """
-        p = self.surfels
+        p = self._surfels_with(opacity_logits)
         field = None if field_mode == "off" else self.field
         learns, bound = field_mode == "train", self.config.weight_bound
         descent = descent if learns else None
@@ -226,13 +231,15 @@ class Scene(nn.Module):
         correction: Tensor | None = None,
         field_mode: Literal["train", "frozen"] = "train",
         descent: TexelDescent | None = None,
+        opacity_logits: Tensor | None = None,
     ) -> ComparedView | None:
         """Draw a view and compare it with its photograph, see `ops.training_view`; None if views need fragment lists.
-        `correction`: colour correction, [3] or [3, 4], see `train.views.View`. `field_mode`, `descent`: as in
-        `render`."""
+        `correction`: colour correction, [3] or [3, 4], see `train.views.View`. `field_mode`, `descent`,
+        `opacity_logits`: as in `render`."""
         texture = self._unlisted_texture(field_mode, descent if field_mode == "train" else None)
         if texture is None:
             return None
         alpha = None if self.field is None else self.field.opacity(self.config.weight_bound, field_mode == "train")
         view = {"near": self.near, "rim": self.config.rim, "alpha": alpha}
-        return training_view(self.config.view_color, self.surfels, camera, photograph, correction, **texture, **view)
+        surfels = self._surfels_with(opacity_logits)
+        return training_view(self.config.view_color, surfels, camera, photograph, correction, **texture, **view)

@@ -193,6 +193,10 @@ class TrainConfig:
     `resolution_schedule`; n times as many lengthen it by a factor of at most sqrt(n)."""
     num_downscales: Annotated[int, Field(ge=0, le=16)] = 2  # Halvings of the image size at the start.
     init_opacity: Annotated[float, Field(gt=0, lt=1)] = 0.1  # Initial opacity of the surfels.
+    dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
+    """Largest probability with which a training view leaves a surfel out; 0 = none. It keeps photographs that are seen
+    often from being learned by heart."""
+    dropout_passes: Positive = 40.0  # Passes over the photographs above which a run has dropout; twice: all of it.
     first_surfels: PositiveCount | None = None
     """Maximum number of initial surfels; excess points are dropped at random. Not given: in ns-train one per 1,000
     pixels that the run renders; else all points."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import time
 import warnings
 from collections.abc import Callable, Mapping
@@ -14,6 +15,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
+from bitymi_ns.ops.parameters import SHAPE_LIMIT
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import RenderOutput
@@ -30,7 +32,15 @@ from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.step_sizes import StepSizes
 from bitymi_ns.train.strategy import Strategy
 from bitymi_ns.train.texels import LearningTexels
-from bitymi_ns.train.views import DownscaledViews, TrainingData, View, at_size, background_changes, step_background
+from bitymi_ns.train.views import (
+    DownscaledViews,
+    TrainingData,
+    View,
+    at_size,
+    background_changes,
+    random_numbers,
+    step_background,
+)
 
 if TYPE_CHECKING:
     from bitymi_ns.ops import TexelDescent
@@ -38,7 +48,26 @@ if TYPE_CHECKING:
     from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import Scene
 
+DROPOUT_NUMBERS = 1 << 40  # number of the first step's dropout: random backgrounds have the numbers below
 TIMED_VIEWS = 3  # views that tell what a step takes at another size
+
+
+def with_dropout(opacity_logits: Tensor, probability: float, seed: int, step: int) -> Tensor:
+    """Leave out surfels of a view at random, as dropout does with the units of a network (Srivastava et al. 2014).
+
+    The odds of the others' opacities are divided by 1 - p, which for small opacities preserves the expected one. Those
+    left out are not drawn and have no gradient. The choice depends only on `seed` and `step`.
+
+    Args:
+        opacity_logits: [N].
+        probability: p, from 0 to below 1.
+
+    Returns:
+        [N] logits to draw the view with.
+    """
+    numbers = random_numbers(seed, DROPOUT_NUMBERS + step, opacity_logits.device)
+    left_out = torch.rand(opacity_logits.shape, generator=numbers, device=opacity_logits.device) < probability
+    return torch.where(left_out, -SHAPE_LIMIT, opacity_logits - math.log1p(-probability))
 
 
 def view_losses(
@@ -49,6 +78,7 @@ def view_losses(
     watch: LossWatch,
     background: Tensor | None = None,
     descent: TexelDescent | None = None,
+    dropout: float = 0.0,
 ) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
     """Render a training view and compare it with its photograph.
 
@@ -57,6 +87,7 @@ def view_losses(
         schedule, step: decide which parts of the scene are trained.
         background: [3] colour behind the scene, where it is constant over steps; None: as the options say.
         descent: see `Scene.render`.
+        dropout: probability with which a surfel is left out.
 
     Returns:
         The weighted loss terms (their sum is the objective) and the rendered view: a `ComparedView` without image if
@@ -70,14 +101,15 @@ def view_losses(
     if background is None or background_changes(config, view):
         background = step_background(config, view, step, device)
     target = view.target(background, device)
+    logits = with_dropout(scene.surfels["opacity_logits"], dropout, config.seed, step) if dropout else None
     field_mode: Literal["train", "frozen"] = "train" if schedule.field_trains(step) else "frozen"
     maps = (view.depth is not None or view.normal is not None) and schedule.geometry_counts(step)
     overdraw_half = loss.overdraw_half if schedule.overdraw_counts(step) else None
     compared: ComparedView | None = None
     if not maps and overdraw_half is None and fused_losses(loss, target):
         photograph = photograph_target(target, loss, view.mask, background)
-        compared = scene.compare(view.camera, photograph, view.correction, field_mode, descent)
-    output = shown = compared or scene.render(view.camera, background, field_mode, maps, overdraw_half, descent)
+        compared = scene.compare(view.camera, photograph, view.correction, field_mode, descent, logits)
+    output = shown = compared or scene.render(view.camera, background, field_mode, maps, overdraw_half, descent, logits)
     if view.correction is not None and isinstance(output, RenderOutput):  # the other one is corrected already
         rgb = view.shown(output.rgb, output.alpha, background)
         image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
@@ -196,8 +228,9 @@ class Training:
             descent = self.texels.prepare(self.step, view, self.guard.factor)
             diverged: TrainingDiverged | None = None
             try:
-                how = (self.schedule, self.step, self.watch, self.background, descent)
-                terms, output = view_losses(self.scene, view, *how)
+                seen = self.processes.views * self.schedule.max_steps / len(self._full_size)
+                how = (self.watch, self.background, descent, self.schedule.dropout(seen))
+                terms, output = view_losses(self.scene, view, self.schedule, self.step, *how)
             except TrainingDiverged as error:
                 diverged = error
             problem = self.processes.first_error(None if diverged is None else str(diverged))

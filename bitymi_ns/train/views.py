@@ -173,8 +173,12 @@ def step_background(config: TrainConfig, view: View, step: int, device: torch.de
     only on seed and step."""
     if not background_changes(config, view):
         return eval_background(config, device)
-    generator = torch.Generator().manual_seed((config.seed * 1_000_003 + step) & 0x7FFF_FFFF_FFFF_FFFF)
-    return torch.rand(3, generator=generator).to(device, non_blocking=True)
+    return torch.rand(3, generator=random_numbers(config.seed, step)).to(device, non_blocking=True)
+
+
+def random_numbers(seed: int, number: int, device: torch.device | str = "cpu") -> torch.Generator:
+    """Return random numbers that depend only on `seed` and `number`."""
+    return torch.Generator(device).manual_seed((seed * 1_000_003 + number) & 0x7FFF_FFFF_FFFF_FFFF)
 
 
 def eval_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:
@@ -307,8 +311,7 @@ def training_order(n: int, seed: int, step: int) -> int:
 
 @functools.lru_cache(maxsize=2)
 def _order(n: int, seed: int, epoch: int) -> list[int]:
-    generator = torch.Generator().manual_seed((seed * 1_000_003 + 7_919 + epoch) & 0x7FFF_FFFF_FFFF_FFFF)
-    return torch.randperm(n, generator=generator).tolist()
+    return torch.randperm(n, generator=random_numbers(seed, 7_919 + epoch)).tolist()
 
 
 T = TypeVar("T")

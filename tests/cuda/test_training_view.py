@@ -60,6 +60,7 @@ def compared(
     correction: str = "none",
     masked: bool = False,
     background: str = "black",
+    dropout: float = 0.0,
 ) -> dict[str, Tensor]:
     """Compute the losses of a view, their gradients, texels after it and the statistics of the projection."""
     case = random_scene(30, 5, WIDTH, HEIGHT)
@@ -77,7 +78,8 @@ def compared(
     config = TrainConfig(background=background, freeze_after=0, freeze_every=2, freeze_min_updates=1)
     schedule = Schedule(config, 100)
     step = 1 if texture == "frozen" else 2
-    terms, output = view_losses(scene, View(camera, photo, mask, gains), schedule, step, LossWatch(), descent=descent)
+    how = {"descent": descent, "dropout": dropout}
+    terms, output = view_losses(scene, View(camera, photo, mask, gains), schedule, step, LossWatch(), **how)
     (2.0 * terms["photometric"] + 3.0 * terms["falloff"]).backward()
     assert isinstance(output, ComparedView) == ops.can_rasterize(device)
     found = {f"gradient of {name}": p.grad for name, p in scene.named_parameters() if p.grad is not None}
@@ -95,7 +97,7 @@ CASES = [
     *({"texture": texture} for texture in ("texels", "moved", "alpha", "frozen")),
     *({"correction": correction, "background": "white"} for correction in ("gains", "affine")),
     {"correction": "affine", "masked": True, "texture": "moved", "background": "random"},
-    {"masked": True, "texture": "alpha", "correction": "gains"},
+    {"masked": True, "texture": "alpha", "correction": "gains", "dropout": 0.3},
 ]
 
 

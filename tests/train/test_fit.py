@@ -5,13 +5,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
 from bitymi_ns.train.divergence import LossWatch
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.step import view_losses
+from bitymi_ns.train.step import view_losses, with_dropout
 from bitymi_ns.train.views import View, at_size
 from tests.train.part_of_a_run import resume, state_of
 
@@ -109,6 +112,38 @@ def test_the_field_learns_on_its_steps_only(make_scene, views):
         assert (scene.field.field_w3.grad is not None) == learns
         assert scene.surfels["means"].grad is not None
         assert output.rgb.shape == (48, 48, 3)
+
+
+@settings(deadline=None, max_examples=20)
+@given(probability=st.floats(0.0, 0.99), seed=st.integers(0, 2**40), step=st.integers(0, 2**30))
+def test_dropout_keeps_the_odds_and_the_expected_share(probability, seed, step):
+    logits = torch.linspace(-6.0, 6.0, 10_000).double().requires_grad_()
+    drawn = with_dropout(logits, probability, seed, step)
+    drawn.sum().backward()
+    kept = drawn > -20.0
+    assert abs(float(kept.double().mean()) - (1.0 - probability)) < 0.02
+    assert torch.equal(logits.grad, kept.double())
+    torch.testing.assert_close(drawn.exp()[kept] * (1.0 - probability), logits.exp()[kept])
+    assert torch.equal(drawn, with_dropout(logits, probability, seed, step))
+    assert probability < 0.01 or not torch.equal(drawn, with_dropout(logits, probability, seed, step + 1))
+
+
+def test_a_view_is_drawn_without_the_surfels_left_out(make_scene, views):
+    scene, schedule = make_scene(texture=False), Schedule(TrainConfig(), 100)
+    terms, _ = view_losses(scene, views[0], schedule, 5, LossWatch(), dropout=0.4)
+    sum(terms.values()).backward()
+    logits = scene.surfels["opacity_logits"]
+    drawn = with_dropout(logits, 0.4, schedule.config.seed, 5).detach()
+    left_out = drawn < -20.0
+    assert 0.2 < float(left_out.float().mean()) < 0.6
+    for name, parameter in scene.surfels.items():
+        assert not parameter.grad[left_out].any(), name
+    assert logits.grad[~left_out].any()
+    rest = Scene(scene.config, {name: value[~left_out] for name, value in scene.surfels.items()}, None, scene.near)
+    rest.surfels["opacity_logits"].data = drawn[~left_out]
+    want, _ = view_losses(rest, views[0], schedule, 5, LossWatch())
+    for name, value in want.items():
+        torch.testing.assert_close(terms[name], value)
 
 
 def test_low_resolution_steps_take_either_picture(make_scene, views):

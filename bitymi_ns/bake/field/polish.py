@@ -66,6 +66,7 @@ def _polish_run(
         guard=GuardConfig(rollbacks=0),  # the guard may drop surfels; here the best state is restored
         texels=TexelConfig(start=0, rate=options.rate, travel=0.0, surfel_rates=options.share),
         num_downscales=0,
+        dropout=0.0,
         exposure="off",
         refine_poses="off",
         seed=options.seed,

@@ -196,7 +196,7 @@ class TrainConfig:
     dropout: Annotated[float, Field(ge=0, lt=1)] = 0.1
     """Largest probability with which a training view leaves a surfel out; 0 = none. It keeps photographs that are seen
     often from being learned by heart."""
-    dropout_passes: Positive = 40.0  # Passes over the photographs above which a run has dropout; twice: all of it.
+    dropout_passes: Positive = 50.0  # Passes over the photographs above which a run has dropout; twice: all of it.
     first_surfels: PositiveCount | None = None
     """Maximum number of initial surfels; excess points are dropped at random. Not given: in ns-train one per 1,000
     pixels that the run renders; else all points."""

@@ -28,7 +28,7 @@ from bitymi_ns.ops import (
 )
 from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.constants import IMAGE_CHANNELS
-from bitymi_ns.ops.parameters import GEOMETRY
+from bitymi_ns.ops.parameters import GEOMETRY, Tensors
 from bitymi_ns.ops.picture_cuda import PhotographTarget
 from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.ops.training_view import ComparedView, training_view
@@ -152,7 +152,7 @@ class Scene(nn.Module):
         center = projection.camera.exact_center
         return view_color(self.config.view_color, self.surfels, means, center, projection.visible)
 
-    def _surfels_with(self, opacity_logits: Tensor | None) -> Mapping[str, Tensor]:
+    def _surfels_with(self, opacity_logits: Tensor | None) -> Tensors:
         return self.surfels if opacity_logits is None else {**self.surfels, "opacity_logits": opacity_logits}
 
     @memory_errors()

@@ -190,7 +190,7 @@ class Schedule:
         needed = 2.0 * texels.travel * views / self.texel_steps
         return max(texels.rate, min(needed, texels.travel)) * self._falling(step)
 
-    def dropout(self, views: int) -> float:
+    def dropout(self, views: float) -> float:
         """Compute the probability with which a view leaves a surfel out, in a run that renders `views` views per
         photograph."""
         return self.config.dropout * min(1.0, max(0.0, views / self.config.dropout_passes - 1.0))

@@ -117,9 +117,9 @@ def test_the_ends_of_the_ranges_have_values_and_gradients_of_the_float64_referen
         drawn = bitymi_ns.rasterize(**values, camera=camera).rgb
         (drawn * weights.to(dtype)).sum().backward()
 
-    def projected(*raw: torch.Tensor) -> Projection:  # a logit has no gradient at the ends
-        means, quats, scales, opacities, betas, *view = raw
-        found = reference_project(means, quats, scales.log(), *torch.zeros_like(betas).expand(2, -1), *view)
+    def projected(*raw: torch.Tensor, **view: Any) -> Projection:  # a logit has no gradient at the ends
+        means, quats, scales, opacities, betas = raw
+        found = reference_project(means, quats, scales.log(), *torch.zeros_like(betas).expand(2, -1), **view)
         return replace(found, opacity=opacities, beta=betas)
 
     monkeypatch.setitem(reference_render.__globals__, "project", projected)

@@ -2,7 +2,8 @@
 
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -69,6 +70,15 @@ def check_options(options: Any, call: Callable[[str], str] = str) -> None:
             fail(f"{call(name)} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
+@contextmanager
+def _naming_files() -> Iterator[None]:
+    """Convert an OSError to a CaptureError that names the file; a decorator."""
+    try:
+        yield
+    except OSError as error:
+        fail(line_of(error) or str(error), error)
+
+
 @dataclass
 class CaptureOptions(SplitOptions, FrameOptions):
     """Options of reading a capture: path, format, files, points, frame and split."""
@@ -96,6 +106,7 @@ class CaptureOptions(SplitOptions, FrameOptions):
     that a message states."""
     poses: Path | None = None  # Folder of the poses that a run was trained with.
 
+    @_naming_files()
     def find(self) -> Found:
         """Recognize the capture. Raises CaptureError: there is none, or an option is for another format."""
         kept, data = read_kept_poses(self.poses), Path(self.data)
@@ -140,6 +151,7 @@ class Capture:
     model: Source | None = None  # found by structure from motion; None = the capture came with poses
 
 
+@_naming_files()
 def read_capture(
     options: CaptureOptions, need_photos: bool = True, want_points: bool = True, found: Found | None = None
 ) -> Capture:
@@ -147,10 +159,7 @@ def read_capture(
     else their files are not opened; `want_points`: color the points, and triangulate missing ones; `found`: what
     `options.find` has found. Raises CaptureError: it cannot be used; names the file and the entry, and says what to
     do."""
-    try:
-        return _Reader(options, found or options.find(), need_photos, want_points).read()
-    except OSError as error:
-        fail(line_of(error) or str(error), error)
+    return _Reader(options, found or options.find(), need_photos, want_points).read()
 
 
 @dataclass

@@ -80,16 +80,20 @@ def recorded(config: TrainConfig) -> str:
     return json.dumps(asdict(config), sort_keys=True)
 
 
+NEW = "new in this version"
+
+
 def other_options(record: str | None, config: TrainConfig) -> list[str]:
     """List the options of a resumed run that differ from the recorded ones. `record`: result of `recorded`; None: a
     checkpoint of an earlier version, without a record. `config`: options of the resumed run."""
     if record is None:
         return []
     before, now = (dict(_flat(json.loads(text))) for text in (record, recorded(config)))
-    different = [name for name in now if name in before and before[name] != now[name]]
+    different = [name for name in now if before.get(name, NEW) != now[name]]
     if not different:
         return []
-    named = ", ".join(f"{name.replace('_', '-')} {now[name]} (was {before[name]})" for name in different)
+    was = {name: f"was {before[name]}" if name in before else NEW for name in different}
+    named = ", ".join(f"{name.replace('_', '-')} {now[name]} ({was[name]})" for name in different)
     return [f"Resumed with other options than were recorded (--pipeline.model.train): {named}."]
 
 

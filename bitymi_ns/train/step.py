@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import Scene
 
-DROPOUT_NUMBERS = 1 << 40  # number of the first step's dropout: random backgrounds have the numbers below
+DROPOUT_NUMBERS = 1 << 30  # number of the first step's dropout; below are those of backgrounds and of the views' order
 TIMED_VIEWS = 3  # views that tell what a step takes at another size
 
 
@@ -56,7 +56,7 @@ def with_dropout(opacity_logits: Tensor, probability: float, seed: int, step: in
     """Leave out surfels of a view at random, as dropout does with the units of a network (Srivastava et al. 2014).
 
     The odds of the others' opacities are divided by 1 - p, which for small opacities preserves the expected one. Those
-    left out are not drawn and have no gradient. The choice depends only on `seed` and `step`.
+    left out are not drawn and have no gradient. The choice depends on `seed`, `step` and the kind of device.
 
     Args:
         opacity_logits: [N].

@@ -177,7 +177,8 @@ def step_background(config: TrainConfig, view: View, step: int, device: torch.de
 
 
 def random_numbers(seed: int, number: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return random numbers that depend only on `seed` and `number`."""
+    """Return random numbers that depend on `seed`, `number` and the kind of device; a CPU takes the lowest 32 bits of
+    what is made of both."""
     return torch.Generator(device).manual_seed((seed * 1_000_003 + number) & 0x7FFF_FFFF_FFFF_FFFF)
 
 

@@ -14,8 +14,8 @@ from bitymi_ns.train.divergence import LossWatch
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.step import view_losses, with_dropout
-from bitymi_ns.train.views import View, at_size
+from bitymi_ns.train.step import DROPOUT_NUMBERS, view_losses, with_dropout
+from bitymi_ns.train.views import View, at_size, random_numbers
 from tests.train.part_of_a_run import resume, state_of
 
 EVERY_EVENT = DensifyConfig(max_surfels=400, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)
@@ -125,6 +125,8 @@ def test_dropout_keeps_the_odds_and_the_expected_share(probability, seed, step):
     assert torch.equal(logits.grad, kept.double())
     torch.testing.assert_close(drawn.exp()[kept] * (1.0 - probability), logits.exp()[kept])
     assert torch.equal(drawn, with_dropout(logits, probability, seed, step))
+    numbers = [torch.rand(3, generator=random_numbers(seed, first + step)) for first in (0, DROPOUT_NUMBERS)]
+    assert not torch.equal(*numbers)
     assert probability < 0.01 or not torch.equal(drawn, with_dropout(logits, probability, seed, step + 1))
 
 

@@ -1,5 +1,7 @@
 """Limits that take effect are reported."""
 
+import json
+
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train import messages
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
@@ -56,3 +58,7 @@ def test_a_resumed_run_names_the_options_that_differ() -> None:
     (sentence,) = messages.other_options(record, other)
     assert "densify.max-surfels 800 (was 0)" in sentence and "exposure gain (was auto)" in sentence
     assert "quats" not in sentence
+    earlier = json.loads(record)
+    del earlier["dropout"]
+    (sentence,) = messages.other_options(json.dumps(earlier), TrainConfig())
+    assert "dropout 0.1 (new in this version)" in sentence and "dropout-passes" not in sentence

@@ -49,7 +49,8 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
     if format == "instant-ngp":
         ours -= {"scale_factor", "scene_scale"}  # there scene_scale multiplies the positions
     options, stock = {}, type(config)()
-    for name, value in vars(config).items():
+    for name in (each.name for each in fields(config)):
+        value = getattr(config, name)
         if name in ours:
             options[name] = value
         elif name not in STOCK_IGNORED and value != getattr(stock, name):

@@ -82,6 +82,7 @@ class BitymiDataParser(DataParser):
         self.downscale_factor: int | None = None  # set by nerfstudio if photographs are not needed: none is opened then
 
     @cached_property
+    @as_input_error()
     def found(self) -> Found:
         """What the capture is recognized as; once."""
         return self.config.find()

@@ -15,6 +15,7 @@ from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.plugin.data import dataset
 from bitymi_ns.plugin.data.capture_checks import reporting_input_errors
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
+from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
 from tests.captures import expect, images_of, load
@@ -111,3 +112,5 @@ def test_a_file_without_permission_is_named(capture: Path, monkeypatch: pytest.M
         BitymiDataManagerConfig(data=capture).setup()
     with pytest.raises(CaptureError, match=line):
         load_capture(capture)
+    with expect(line):
+        BitymiDataParserConfig(data=capture).setup().get_dataparser_outputs("train")

@@ -176,7 +176,8 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
         environment = {**environment, "TMPDIR": folder, "PYTHONUNBUFFERED": "1"}
         print(*command, file=log, flush=True)
         done = subprocess.run(limited, cwd=tree, env=environment, stdout=log, stderr=subprocess.STDOUT, check=False)
-    result = "stopped" if done.returncode == -signal.SIGKILL else str(done.returncode)
+    late = time.perf_counter() - start >= limit  # killed earlier, it ran out of memory
+    result = "stopped" if late and done.returncode == -signal.SIGKILL else str(done.returncode)
     last = text.read_text(errors="replace").strip().splitlines()[-1].replace("|", "/")
     result += "" if result == "0" else f": {last}"
     return f"| {step.name} | {result} | {time.perf_counter() - start:.0f} |"

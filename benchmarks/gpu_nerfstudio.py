@@ -106,15 +106,9 @@ def commands(capture: Path, steps: int, options: Sequence[str]) -> list[list[obj
         ["ns-export", "bitymi-atlas", "--load-config", config, "--output-dir", "bundle"],
         ["ns-eval", "--load-config", bundle, "--output-path", "baked.json"],
         [
-            "ns-render",
-            "dataset",
-            "--load-config",
+            *"ns-render dataset --load-config".split(),
             bundle,
-            "--output-path",
-            "maps",
-            "--rendered-output-names",
-            "rgb",
-            "depth",
+            *"--output-path maps --rendered-output-names rgb depth".split(),
         ],
     ]
 
@@ -130,7 +124,7 @@ def quality(folder: Path) -> str:
 
 
 def main(parser: Arguments, words: Sequence[str]) -> int:
-    """Run the commands on a capture and publish their costs; return 1 if any failed."""
+    """Run the commands on a capture until one fails, and publish their costs; return 1 if one has failed."""
     parser.add_argument("data", type=Path, help="folder of an undistorted capture with transforms.json")
     parser.add_argument("--steps", type=int, default=3000, help="length of the run (%(default)s)")
     parser.add_argument("--folder", type=Path, required=True, help="of runs, bundle and log; emptied first")
@@ -141,8 +135,10 @@ def main(parser: Arguments, words: Sequence[str]) -> int:
     shutil.rmtree(folder, ignore_errors=True)
     environment, costs = stand_in(folder / "stand-ins"), Rows(("command", "s", "MB of host", "MB of card"))
     try:
-        done = [run(c, folder, environment, costs) for c in commands(capture, arguments.steps, arguments.options)]
+        for command in commands(capture, arguments.steps, arguments.options):
+            if not run(command, folder, environment, costs):
+                return 1
     finally:  # an interrupted run leaves its results
         title, notes = f"nerfstudio on {capture.name}, {arguments.steps} steps", [f"Stand-ins for {', '.join(NAMES)}."]
         publish(title, f"{costs}\n\n{quality(folder)}", notes, arguments.output)
-    return int(not all(done))
+    return 0

@@ -53,7 +53,8 @@ def read_names_of_callers() -> None:
     command. Without: half of a command's start is spent there. Superfluous once nerfstudio asks for the one name that
     it reads.
     """
-    external_methods.__dict__["inspect"] = SimpleNamespace(
+    listing: Any = external_methods
+    listing.inspect = SimpleNamespace(
         stack=lambda: [SimpleNamespace(function=frame.f_code.co_name) for frame in _callers(2)]
     )
 
@@ -263,9 +264,10 @@ def patch_viewer(config: Any) -> None:
     cannot be shown. Superfluous once ns-viewer keeps recorded options, listens on this machine alone, and catches
     Ctrl-C.
     """
+    script: Any
     for script in map(sys.modules.get, (VIEWER, "__main__")):
         if hasattr(script, "_start_viewer"):
-            vars(script)["_start_viewer"] = partial(_start_viewer, config, vars(script)["_start_viewer"])
+            script._start_viewer = partial(_start_viewer, config, script._start_viewer)
 
 
 def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any) -> None:

@@ -190,10 +190,10 @@ class Schedule:
         needed = 2.0 * texels.travel * views / self.texel_steps
         return max(texels.rate, min(needed, texels.travel)) * self._falling(step)
 
-    def dropout(self, views: float) -> float:
-        """Compute the probability with which a view leaves a surfel out, in a run that renders `views` views per
-        photograph."""
-        return self.config.dropout * min(1.0, max(0.0, views / self.config.dropout_passes - 1.0))
+    def dropout(self, passes: float) -> float:
+        """Compute the probability with which a view leaves a surfel out, in a run that renders each photograph `passes`
+        times."""
+        return self.config.dropout * min(1.0, max(0.0, passes / self.config.dropout_passes - 1.0))
 
     def pose_pixels(self, step: int) -> float:
         """Compute the length of a pose step, pixels; 0 if poses are fixed in this step."""

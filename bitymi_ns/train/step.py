@@ -224,12 +224,13 @@ class Training:
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
         """Compute `view_losses`. If a loss is not finite, the guard repairs the scene and the view is rendered again.
         Raises TrainingDiverged: the scene cannot be repaired, or the limit of rollbacks is reached."""
+        passes = self.processes.views * self.schedule.max_steps / len(self._full_size)
+        dropout = self.schedule.dropout(passes)
         while True:
             descent = self.texels.prepare(self.step, view, self.guard.factor)
             diverged: TrainingDiverged | None = None
             try:
-                seen = self.processes.views * self.schedule.max_steps / len(self._full_size)
-                how = (self.watch, self.background, descent, self.schedule.dropout(seen))
+                how = (self.watch, self.background, descent, dropout)
                 terms, output = view_losses(self.scene, view, self.schedule, self.step, *how)
             except TrainingDiverged as error:
                 diverged = error

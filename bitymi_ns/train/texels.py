@@ -133,8 +133,10 @@ class LearningTexels:
     def step(self) -> None:
         """Update colours and alphas by their averaged gradients."""
         field = self.scene.field
+        if not isinstance(field, TexelField):
+            return
         for values in self._parameters:
-            if values.grad is not None and isinstance(field, TexelField):
+            if values.grad is not None:
                 share = field.share if values is field.alpha else field.share[:, None]
                 values.addcmul_(share, values.grad, value=-1.0)
                 values.grad = None

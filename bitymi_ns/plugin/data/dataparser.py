@@ -84,7 +84,7 @@ class BitymiDataParser(DataParser):
     @cached_property
     @as_input_error()
     def found(self) -> Found:
-        """What the capture is recognized as; once."""
+        """Recognize the capture, once."""
         return self.config.find()
 
     @cached_property

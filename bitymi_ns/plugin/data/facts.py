@@ -1,4 +1,4 @@
-"""What is known of a capture beside nerfstudio's fields: one record on its way from the reader to the model."""
+"""Carry what is known of a capture beside nerfstudio's fields, in one record, from the reader to the model."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from operator import attrgetter
 from typing import Any
 
 import torch
@@ -74,7 +73,8 @@ class SurfelModel(Model):
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
         """Move the model, except to a device without kernels here, as nerfstudio's tools use any GPU."""
-        device, dtype, _, _ = attrgetter("_nn._parse_to")(torch._C)(*args, **kwargs)
+        core: Any = torch._C
+        device, dtype, _, _ = core._nn._parse_to(*args, **kwargs)
         if dtype is not None:
             raise ValueError("the scene is float32")
         return self if device is None else super().to(kernel_device(device))

@@ -3,8 +3,9 @@
 scripts/test_environment.py --work FOLDER [--data CAPTURE] [--end oldest|newest]
 
 The oldest is nerfstudio's documented environment, in which pip must change nothing. The newest is what pip gives
-without constraints.txt, and then the newest releases of what nerfstudio's requirements hold back. The versions found
-are written to scripts/environments, which tests/scripts compares with pyproject.toml."""
+without constraints.txt, and then the newest releases of what nerfstudio's requirements hold back. The versions found of what
+the package requires, and of what pip must leave alone, are written to scripts/environments, which tests/scripts
+compares with pyproject.toml."""
 
 import argparse
 import os
@@ -104,7 +105,9 @@ def try_end(name: str, work: Path, data: Path | None) -> None:
         sys.exit(f"test environment: pip changes {sorted(changed)} of the {name} environment")
     if renewed:
         environment.pip("install", "-q", "--upgrade", "--no-deps", *renewed)
-    found = "".join(f"{each}=={version}\n" for each, version in environment.versions().items())
+    required = environment.pip("show", "bitymi-ns").split("Requires: ")[1].splitlines()[0].lower().replace("_", "-")
+    recorded = KEPT | {*required.split(", ")}
+    found = "".join(f"{each}=={version}\n" for each, version in environment.versions().items() if each in recorded)
     python = environment.run("python", "-c", "import platform; print(platform.python_version())").strip()
     (FOUND / f"{name}.txt").write_text(f"# Python {python}: written by scripts/test_environment.py\n{found}", "utf8")
     try_commands(environment, data)

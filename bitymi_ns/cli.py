@@ -11,8 +11,9 @@ from typing import Annotated, Literal, TextIO
 
 import tyro
 
-from bitymi_ns import KernelsUnavailable, exit_messages
+from bitymi_ns import exit_messages
 from bitymi_ns.capture.types import SfmOptions
+from bitymi_ns.errors import KernelsUnavailable
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.measure.bench.cli import BenchRun
 from bitymi_ns.trust import listed, printable

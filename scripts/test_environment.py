@@ -3,9 +3,9 @@
 scripts/test_environment.py --work FOLDER [--data CAPTURE] [--end oldest|newest]
 
 The oldest is nerfstudio's documented environment, in which pip must change nothing. The newest is what pip gives
-without constraints.txt, and then the newest releases of what nerfstudio's requirements hold back. The versions found of what
-the package requires, and of what pip must leave alone, are written to scripts/environments, which tests/scripts
-compares with pyproject.toml."""
+without constraints.txt, and then the newest releases of what nerfstudio's requirements hold back. The versions found
+of what the package requires, and of what pip must leave alone, are written to scripts/environments, which
+tests/scripts compares with pyproject.toml."""
 
 import argparse
 import os

@@ -15,6 +15,7 @@ import bitymi_ns
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "codec", "bundle", "train", "bake", "interchange", "view", "plugin", "measure"]
 BESIDE = [
+    "errors",
     "exit_messages",
     "files",
     "locks",
@@ -79,6 +80,13 @@ def test_what_stands_beside_the_layers_imports_none_of_them(name: str) -> None:
     for path in [path for module, path in MODULES.items() if f"{module}.".startswith(f"bitymi_ns.{name}.")]:
         for imported, _ in imports(path):
             assert ".".join(imported.split(".")[:2]) not in layers, f"{path} imports {imported}"
+
+
+def test_no_module_imports_what_the_package_itself_defines() -> None:
+    """It names public functions and the version for users; modules are imported from where they stand."""
+    for module, path in MODULES.items():
+        found = [name for name, _ in imports(path) if module_of(name) == "bitymi_ns" and name != "bitymi_ns"]
+        assert module == "bitymi_ns" or not found, f"{path} imports {found}"
 
 
 def test_nerfstudio_is_known_to_the_plugin_and_to_what_measures_it_alone() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import importlib.metadata
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,7 +12,6 @@ from typing import Any
 
 import torch
 
-from bitymi_ns import __version__
 from bitymi_ns.bundle import compact, ktx2, ply
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
@@ -41,7 +41,7 @@ from bitymi_ns.ops.view_color import check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
 
-GENERATOR = f"bitymi-ns {__version__}"
+GENERATOR = f"bitymi-ns {importlib.metadata.version('bitymi-ns')}"
 _CHUNK = 1 << 22
 
 

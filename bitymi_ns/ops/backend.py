@@ -12,7 +12,7 @@ from typing import Any, Generic, TypeVar
 import torch
 from torch import Tensor
 
-from bitymi_ns import KernelsUnavailable
+from bitymi_ns.errors import KernelsUnavailable
 
 T = TypeVar("T")
 SUFFIX = {torch.float32: "_f32", torch.float64: "_f64"}

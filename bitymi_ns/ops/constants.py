@@ -5,7 +5,7 @@ The float64 twins in `ops.reference` state those of the formulas again, as an in
 
 from typing import Any
 
-from bitymi_ns import KernelsUnavailable
+from bitymi_ns.errors import KernelsUnavailable
 
 from .backend import load
 

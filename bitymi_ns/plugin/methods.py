@@ -10,7 +10,7 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from bitymi_ns import KernelsUnavailable
+from bitymi_ns.errors import KernelsUnavailable
 
 
 @dataclass

@@ -8,7 +8,8 @@ import torch
 
 pytest.importorskip("nerfstudio")
 
-from bitymi_ns import KernelsUnavailable, cli
+from bitymi_ns import cli
+from bitymi_ns.errors import KernelsUnavailable
 from bitymi_ns.measure import doctor
 from bitymi_ns.plugin.run import config, device
 

@@ -20,7 +20,7 @@ read_text = Path.read_text
 Path.read_text = lambda path, *words, **options: read_text(
     Path(sys.argv[1]) if str(path) == "/proc/cpuinfo" else path, *words, **options
 )
-from bitymi_ns import KernelsUnavailable
+from bitymi_ns.errors import KernelsUnavailable
 try:
     import bitymi_ns.ops
 except KernelsUnavailable as error:

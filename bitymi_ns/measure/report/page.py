@@ -1,11 +1,11 @@
 """Composition of a report as one self-contained HTML page."""
 
+import importlib.metadata
 import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns import __version__
 from bitymi_ns.files import check_writable, write_errors_as, write_file
 from bitymi_ns.measure.markdown import rendered
 from bitymi_ns.measure.report.pictures import ERROR_SCALE, compare_views
@@ -28,7 +28,7 @@ def compose(records: Records, title: str) -> dict[str, Any]:
     measured = f" Measured on: {'; '.join(dict.fromkeys(records.machines))}." if records.machines else ""
     return {
         "title": title,
-        "intro": f"{counted}. Made by bitymi report {__version__}.{measured}",
+        "intro": f"{counted}. Made by bitymi report {importlib.metadata.version('bitymi-ns')}.{measured}",
         "views": compare_views(records.images, notes),
         "quality": quality_tables(over_seeds(records.evaluations)),
         "sections": grouped(draw_plots(records.evaluations, records.curves), lambda plot: plot.section),

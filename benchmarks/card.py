@@ -1,8 +1,8 @@
 #!/usr/bin/env python
 """Transfer the package to a bare machine with a GPU, and run tests and benchmarks there.
 
-`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies and
-nerfstudio's except torch and numpy, and sorts them into parts FOLDER/0, FOLDER/1, ... of limited size. `card.py run
+`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies
+except torch and numpy, and sorts them into parts FOLDER/0, FOLDER/1, ... of limited size. `card.py run
 ORDER... --stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has its own time
 limit."""
 
@@ -21,17 +21,14 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 CARRIED = ("bitymi_ns", "benchmarks", "tests", "method_configs", "pyproject.toml", "csrc", "docs", "README.md")
 NEEDED = ("ispc_texcomp", "pydantic", "flip-evaluator", "torchmetrics", "lightning-utilities", "typing-extensions")
-NEEDED += ("wgpu", "cffi", "pycparser", "rendercanvas")
-NEEDED += ("nerfstudio", "viser", "websockets", "msgspec", "trimesh", "tyro", "docstring-parser", "typeguard")
-NEEDED += ("appdirs", "mediapy", "pyquaternion", "pytorch-msssim", "splines", "pycolmap", "nerfacc")
-"""Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt.
-nerfstudio's other imports have stand-ins (gpu_nerfstudio.py)."""
+NEEDED += ("wgpu", "cffi", "pycparser", "rendercanvas", "nerfstudio", "tyro", "docstring-parser", "typeguard")
+NEEDED += ("pycolmap", "pillow-heif")
+"""Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt."""
 TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
 CHECKED = ("baked", "training", "texels", "listed")  # sections of `times.py cuda`
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
-ORDERS = ("check", "webgpu", "train", "frames", "gaussians", "peers", "nerfstudio")
-GAUSSIANS = ("300000", "1000000")  # numbers of Gaussians trained for comparison
+ORDERS = ("check", "webgpu", "train", "frames")
 
 
 @dataclass(frozen=True)
@@ -43,23 +40,21 @@ class Step:
     limit: float  # seconds
 
 
-def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (), length: int = 0) -> list[Step]:
-    """Build the steps of an order. `frames` and `peers` render the bundles of `train`, `peers` also the Gaussians of
-    `gaussians`.
+def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (), length: int = 30_000) -> list[Step]:
+    """Build the steps of an order. `frames` draws the bundles of `train`.
 
     Args:
         results: folder of the tables.
         data: folder of captures.
         surfels: numbers of surfels of the synthetic scenes.
-        length: steps of the runs of `train` and `nerfstudio`; 0: 30,000, and the script's default.
+        length: steps of the runs of `train`.
     """
     times = (sys.executable, "benchmarks/times.py")
     pytest = (sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "-o", "faulthandler_timeout=60")
     sanitizer = ("compute-sanitizer", "--error-exitcode", "9", "--print-limit", "20", "--tool")
     bundles = results / "bundles"
-    page = ("--output", results / f"{order}.md")
     if order == "check":
-        large = ("--surfels", "150000", "--size", "1297x840", "--times", "20")
+        large = ("--surfels", "150000", "--size", "1297", "840", "--times", "20")
         return [
             Step("block textures", [sys.executable, "-c", BLOCKS], 60),
             Step("tests", [*pytest, "tests/cuda", "-k", "not emulated"], 240),
@@ -70,22 +65,14 @@ def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (),
         return [Step("webgpu tests", [*pytest, "tests/ops/webgpu"], 60)]
     if order == "frames":
         kept = sorted(file.parent for file in bundles.glob("**/bundle.json"))
-        bundled = ["--bundles", *kept] if kept else []
-        return [Step(order, [*times, "frames", "--runs", "100", "--surfels", *surfels, *bundled, *page], 200)]
+        drawn = ["--surfels", *surfels, *(["--bundles", *kept] if kept else [])]
+        return [Step(order, [*times, "frames", "--runs", "100", *drawn, "--output", results / "frames.md"], 200)]
+    train = (sys.executable, "benchmarks/long.py")
+    options = ("--runs", f"{length}/1", "--device", "cuda", "--work", results / "runs")
     steps = []
     for folder in sorted(file.parent for file in data.glob("*/transforms.json")):
-        name, kept = folder.name, bundles / folder.name
-        page = ("--output", results / f"{name}-{order}.md")
-        gaussians = ("--gaussians", results / name)
-        on_card = ("--runs", f"{length or 30_000}/1", "--device", "cuda", "--work", results / "runs", "--keep", kept)
-        runs = ("--folder", results / f"{name}-runs", *(("--steps", length) if length else ()))
-        command, limit = {
-            "train": ((sys.executable, "benchmarks/long.py", folder, *on_card, *page), 600),
-            "gaussians": ((*times, "peers", folder, "--train", *GAUSSIANS, *gaussians), 600),
-            "peers": ((*times, "peers", folder, "--bundles", *sorted(kept.glob("*")), *gaussians, *page), 120),
-            "nerfstudio": ((*times, "nerfstudio", folder, *runs, *page), 600),
-        }[order]
-        steps.append(Step(f"{order} on {name}", command, limit))
+        written = ("--keep", bundles / folder.name, "--output", results / f"{folder.name}-train.md")
+        steps.append(Step(f"train on {folder.name}", [*train, folder, *options, *written], 600))
     return steps
 
 
@@ -200,7 +187,7 @@ def main() -> int:
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
     running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")
-    running.add_argument("--steps", type=int, default=0, help="of the runs of `train` and `nerfstudio`")
+    running.add_argument("--steps", type=int, default=30_000, help="of the runs of `train` (%(default)s)")
     running.add_argument("--seconds", type=float, default=570, help="for all of it (%(default)s)")
     arguments = parser.parse_args()
     if arguments.command == "stage":

@@ -23,13 +23,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from harness import Arguments, means, say, table
+import tyro
 from scenes import SplitCapture, load_capture
 
 from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.files import write_file
+from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.machine import processor
+from bitymi_ns.measure.markdown import table
+from bitymi_ns.measure.report.records import means
 from bitymi_ns.plugin.run import lpips
 from bitymi_ns.sample import generate
 from bitymi_ns.scene.config import SceneConfig
@@ -41,8 +44,6 @@ from bitymi_ns.train.losses import psnr
 
 BASELINE = Path(__file__).with_suffix(".json")
 THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-
-
 SETTINGS = {"steps": 320, "tuning": 20, "seeds": 4}
 """The job: steps of training and of texel tuning, and number of seeds."""
 
@@ -57,11 +58,6 @@ class Limit:
     relative: bool = True  # `by` is a share of the baseline, not a difference
     digits: int = 0  # decimals to print
     timed: bool = False  # depends on the processor; compared only on the baseline's model
-
-    def worse(self, value: float, baseline: float, slack: float = 1.0) -> bool:
-        """Return True if the figure is worse than the baseline by more than `slack` times its limit."""
-        loss = baseline - value if self.better == "more" else value - baseline
-        return loss > slack * (self.by * abs(baseline) if self.relative else self.by)
 
 
 LIMITS = {
@@ -191,76 +187,66 @@ def measure(capture: Path | None) -> Scenes:
     return found
 
 
-Line = tuple[str, str, list[str]]  # figure, verdict, cells of the table
-
-
-def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> list[Line]:
-    """Compare each figure with its baseline. Verdicts: "ok", "WORSE", "new" (no baseline) or "not judged" (a time on
-    another processor model, or LPIPS without its weights)."""
-    lines = []
+def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> tuple[list[list[str]], list[str]]:
+    """Compare each figure with its baseline: a row of the table each, and the names of those that are worse. Not judged
+    are times on another processor model, and LPIPS without its weights."""
+    rows, worse = [], []
     for scene, figures in found.items():
         for key, limit in LIMITS.items():
             before, now = baseline.get(scene, {}).get(key), figures[key]
-            if before is None:
-                verdict, change = "new", ""
-            else:
-                slack = 1.0 if same_cpu else ELSEWHERE
-                verdict = "WORSE" if limit.worse(now, before, slack) else "ok"
-                relative = f"{100 * (now / before - 1):+.1f} %" if limit.relative else ""
-                change = relative or f"{now - before:+.{limit.digits}f}"
+            verdict, change = "new", ""
+            if before is not None:
+                change = f"{100 * (now / before - 1):+.1f} %" if limit.relative else f"{now - before:+.{limit.digits}f}"
+                allowed = limit.by * (abs(before) if limit.relative else 1.0) * (1.0 if same_cpu else ELSEWHERE)
+                verdict = "WORSE" if (now - before) * (-1 if limit.better == "more" else 1) > allowed else "ok"
                 if limit.timed and not same_cpu or math.isnan(now):
                     verdict = "not judged"
+            if verdict == "WORSE":
+                worse.append(key)
             shown = ["" if value is None else f"{value:,.{limit.digits}f}" for value in (before, now)]
-            allowed = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
-            lines.append((key, verdict, [scene, limit.title, *shown, change, allowed, verdict]))
-    return lines
+            may = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
+            rows.append([scene, limit.title, *shown, change, may, verdict])
+    return rows, worse
 
 
-def quicker(found: Scenes, again: Scenes) -> Scenes:
-    """Take the figures of the first run, but the smaller times of both."""
-    timed = [key for key, limit in LIMITS.items() if limit.timed]
-    return {scene: {**f, **{key: min(f[key], again[scene][key]) for key in timed}} for scene, f in found.items()}
+def main(capture: Path | None = None, accept: bool = False, baseline: Path = BASELINE) -> None:
+    """Measure the job and compare it with the baseline, or accept it as the baseline.
 
-
-def main() -> None:
-    """Measure the job and compare it with the baseline, or accept it as the baseline."""
-    parser = Arguments(__doc__)
-    parser.add_argument("--capture", type=Path, help="an undistorted capture to run at half its size beside the room")
-    parser.add_argument("--accept", action="store_true", help="make the figures the new baseline")
-    parser.add_argument("--baseline", type=Path, default=BASELINE, help="the file to compare with, or to write")
-    options = parser.parse_args()
+    Args:
+        capture: An undistorted capture to run at half its size beside the room.
+        accept: Make the figures the new baseline.
+        baseline: File to compare with, or to write.
+    """
     try:
         lpips.load("alex")
     except lpips.LpipsUnavailable as error:
         say(f"gate: LPIPS is not judged: {error}")
         os.environ["BITYMI_NO_DOWNLOAD"] = "1"  # do not try again for every view
     empty = {"settings": SETTINGS, "processor": processor(), "scenes": {}}
-    baseline = json.loads(options.baseline.read_text("utf8")) if options.baseline.is_file() else empty
-    if not options.accept and baseline["settings"] != SETTINGS:
-        raise SystemExit(f"gate: the baseline is of {baseline['settings']}, not of {SETTINGS}")
-    found = measure(options.capture)
-    same_cpu = baseline["processor"] == processor()
-    lines = judge(found, baseline["scenes"], same_cpu)
-    worse = [key for key, verdict, _ in lines if verdict == "WORSE"]
-    if worse and all(LIMITS[key].timed for key in worse) and not options.accept:
+    stored = json.loads(baseline.read_text("utf8")) if baseline.is_file() else empty
+    if not accept and stored["settings"] != SETTINGS:
+        raise SystemExit(f"gate: the baseline is of {stored['settings']}, not of {SETTINGS}")
+    figures = measure(capture)
+    same_cpu = stored["processor"] == processor()
+    rows, worse = judge(figures, stored["scenes"], same_cpu)
+    if worse and all(LIMITS[key].timed for key in worse) and not accept:
         say("gate: slower than the baseline; timed once more, as the machine may have been busy")
-        found = quicker(found, measure(options.capture))
-        lines = judge(found, baseline["scenes"], same_cpu)
-        worse = [key for key, verdict, _ in lines if verdict == "WORSE"]
-    rows = [cells for *_, cells in lines]
+        again, timed = measure(capture), [key for key, limit in LIMITS.items() if limit.timed]
+        figures = {name: f | {key: min(f[key], again[name][key]) for key in timed} for name, f in figures.items()}
+        rows, worse = judge(figures, stored["scenes"], same_cpu)
     print(table(("scene", "figure", "baseline", "now", "change", "may be worse by", ""), rows, (0, 1, 6)))
     if not same_cpu:
         print(
-            f"\nThe baseline is of {baseline['processor']}, this is {processor()}: times are not judged, and the other "
+            f"\nThe baseline is of {stored['processor']}, this is {processor()}: times are not judged, and the other "
             f"figures may be worse by {ELSEWHERE:g} times as much, because kernels round differently there."
         )
-    if options.accept:
-        rounded = {name: {k: round(v, 5) for k, v in f.items() if not math.isnan(v)} for name, f in found.items()}
+    if accept:
+        rounded = {name: {k: round(v, 5) for k, v in f.items() if not math.isnan(v)} for name, f in figures.items()}
         # keep other captures' figures of the same job and processor model
-        kept = baseline["scenes"] if {**baseline, "scenes": {}} == {**empty, "scenes": {}} else {}
+        kept = stored["scenes"] if {**stored, "scenes": {}} == empty else {}
         text = json.dumps({**empty, "scenes": {**kept, **rounded}}, indent=2, sort_keys=True)
-        write_file(options.baseline, (text + "\n").encode())
-        print(f"\nThe new baseline is in {options.baseline}; commit it with the change that it belongs to.")
+        write_file(baseline, (text + "\n").encode())
+        print(f"\nThe new baseline is in {baseline}; commit it with the change that it belongs to.")
     elif worse:
         raise SystemExit(
             f"\ngate: {len(worse)} of {len(rows)} figures are worse than the baseline allows. Mend the change, "
@@ -269,4 +255,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    tyro.cli(main, description=__doc__)

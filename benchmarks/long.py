@@ -1,5 +1,5 @@
 #!/usr/bin/env python
-"""Compare training options in long and short runs, with the core packages only (without nerfstudio): no default is
+"""Compare training options in long and short runs, without nerfstudio's commands: no default is
 chosen from short runs alone.
 
     python benchmarks/long.py DATA... --rows bitymi "bitymi train.texels.mean_rates=0.2" --runs 10000/4 1500/2 300/1
@@ -16,7 +16,6 @@ import statistics
 import sys
 import tempfile
 import time
-from argparse import Namespace
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,8 +23,8 @@ from typing import Any
 from zlib import crc32
 
 import torch
+import tyro
 import yaml
-from harness import Arguments, means, publish, say
 from scenes import load_capture
 from torch import Tensor
 
@@ -33,9 +32,11 @@ from bitymi_ns import bake_scene
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.locks import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, identity, provenance
+from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.machine import commit
+from bitymi_ns.measure.markdown import page, publish
 from bitymi_ns.measure.report.read import add_cells
-from bitymi_ns.measure.report.records import Records, over_seeds
+from bitymi_ns.measure.report.records import Records, means, over_seeds
 from bitymi_ns.measure.report.tables import quality_markdown
 from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.ranges import spread
@@ -49,9 +50,26 @@ from bitymi_ns.train.preset import Loader, Preset, load_preset
 from bitymi_ns.train.views import View, eval_background
 from bitymi_ns.trust import finite_numbers
 
-RUNS = ("10000/4", "1500/2", "300/1")
 Figures = dict[str, dict[str, Any]]
 """Values of a run's cells: `train`, `eval`, and `export NAME` and `eval NAME` of each bundle."""
+
+
+@dataclass
+class Options:
+    """Options of the command line."""
+
+    data: tyro.conf.Positional[tuple[Path, ...]]  # Folders with a transforms.json, or such files.
+    rows: tuple[str, ...] = ("bitymi",)  # A method each, and its settings: PATH=VALUE ...
+    runs: tuple[str, ...] = ("10000/4", "1500/2", "300/1")  # STEPS/REDUCTION each.
+    seeds: tuple[int, ...] = (0,)
+    photographs: int = 0  # Train on so many photographs only; 0 = all.
+    bake: bool = False  # Also bake: bytes, and quality of the bundle.
+    keep: Path | None = None  # Bake, and keep the bundles in this folder.
+    megabytes: tuple[float, ...] = ()  # Bake bundles of these sizes, too.
+    align: bool = False  # Align held-out poses of rows without refinement, too.
+    device: str = "cpu"  # cpu or cuda
+    work: Path = Path("outputs/long")  # Folder of the finished runs.
+    output: Path | None = None  # Also write the table to this Markdown file.
 
 
 @dataclass(frozen=True)
@@ -63,7 +81,7 @@ class LongRun:
     steps: int
     reduction: int
     seed: int
-    options: Namespace
+    options: Options
 
     def __str__(self) -> str:
         return f"{self.scene}, {self.row}, seed {self.seed}"
@@ -191,8 +209,7 @@ def measure(run: LongRun) -> Figures:
     return found | {"eval": {"results": results}}  # the last cell: the run is complete
 
 
-def main() -> None:
-    options = read_arguments()
+def main(options: Options) -> None:
     torch.set_num_threads(1)
     options.bake |= options.keep is not None or bool(options.megabytes)
     runs = [
@@ -219,25 +236,8 @@ def main() -> None:
     cells.refresh()
     records, own = Records(), {identity(run.key(), "cell") for run in runs}
     add_cells((cell for cell in cells if identity(cell["key"], "cell", "bundle") in own), cells.path, records)
-    publish("Long and short runs", quality_markdown(over_seeds(records.evaluations)), (), options.output)
-
-
-def read_arguments() -> Namespace:
-    parser = Arguments(__doc__)
-    parser.add_argument("data", nargs="+", type=Path, help="folders with a transforms.json, or such files")
-    parser.add_argument("--rows", nargs="+", default=["bitymi"], help="a method each, and its settings: PATH=VALUE ...")
-    parser.add_argument("--runs", nargs="+", default=list(RUNS), help="STEPS/REDUCTION each")
-    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
-    parser.add_argument("--photographs", type=int, default=0, help="train on so many photographs only; 0 = all")
-    parser.add_argument("--bake", action="store_true", help="also bake: bytes, and quality of the bundle")
-    parser.add_argument("--keep", type=Path, help="bake, and keep the bundles in this folder")
-    parser.add_argument("--megabytes", nargs="+", type=float, default=[], help="bake bundles of these sizes, too")
-    parser.add_argument("--align", action="store_true", help="align held-out poses of rows without refinement, too")
-    parser.add_argument("--device", default="cpu", help="cpu or cuda (%(default)s)")
-    parser.add_argument("--work", type=Path, default=Path("outputs/long"), help="folder of the finished runs")
-    parser.add_output()
-    return parser.parse_args()
+    publish(page("Long and short runs", quality_markdown(over_seeds(records.evaluations))), options.output)
 
 
 if __name__ == "__main__":
-    main()
+    main(tyro.cli(Options, description=__doc__))

@@ -1,44 +1,34 @@
 #!/usr/bin/env python
-"""Measure times: `times.py COMMAND OPTION...`; `times.py COMMAND --help` lists the options.
+"""Measure times: `times.py COMMAND --help` lists the options."""
 
-kernels      each CPU kernel
-frames       frames of baked scenes on a GPU
-cuda         CUDA kernels: each once, for sanitizers, or its time
-peers        gsplat beside bundles of a capture on a GPU
-nerfstudio   nerfstudio's commands on a capture, with a GPU or without
-"""
-
+import math
 import os
+import shlex
+import shutil
+import statistics
 import sys
+import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from importlib import import_module
-from inspect import cleandoc
 from pathlib import Path
+from typing import Literal
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads OpenMP
 
 import torch
-from harness import (
-    Arguments,
-    Options,
-    Rows,
-    device_milliseconds,
-    image_size,
-    number,
-    publish,
-    say,
-    seconds,
-    table,
-)
+import tyro
 from scenes import around, textured, trained_like, with_texels
 from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
+from bitymi_ns.measure.bench.process import CommandFailed, run_measured, say, tool
+from bitymi_ns.measure.markdown import number, page, publish, table
+from bitymi_ns.measure.report.read import collect
+from bitymi_ns.measure.report.tables import quality_markdown
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.baked import IMAGES
 from bitymi_ns.ops.baked_cuda import Stage
@@ -50,12 +40,54 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField, TexelField
 
 CPU = torch.device("cpu")
-WARM_UP = 2
 TILE_SIDE = 8
-SIZES = ((1297, 840), (1920, 1080), (3840, 2160))
+CLOCK = 2.0e9  # upper bound of GPU clocks, Hz, to convert seconds to cycles of `torch.cuda._sleep`
 TIMED = ("list", "draw", "frame", "graph", "packed")
 HEADER = ("scene", "size", "million pairs", "fragments/pixel", *(f"{name} ms" for name in TIMED), "frames/s")
 Run = Callable[[], object]
+
+
+def gpu() -> torch.device:
+    """Return the first GPU; end the script without one."""
+    if not torch.cuda.is_available():
+        raise SystemExit("no CUDA device was found (or torch is a CPU build)")
+    return torch.device("cuda")
+
+
+def seconds(run: Run, runs: int, warm_up: int = 2) -> tuple[float, float]:
+    """Measure the median wall-clock and CPU seconds of a call on the CPU, after `warm_up` untimed calls."""
+    times = []
+    for _ in range(warm_up + runs):
+        wall, cpu = time.perf_counter(), time.process_time()
+        run()
+        times.append((time.perf_counter() - wall, time.process_time() - cpu))
+    wall, cpu = map(statistics.median, zip(*times[warm_up:], strict=True))
+    return wall, cpu
+
+
+def device_milliseconds(run: Run, runs: int) -> float:
+    """Measure the median time of a call on the GPU, after ten untimed ones. Calls are queued behind a spin of the
+    device that outlasts the queueing, so that launches are not measured. Synchronisations within a call are."""
+    for _ in range(10):
+        run()
+    torch.cuda.synchronize()
+    start = time.perf_counter()
+    run()
+    host = time.perf_counter() - start
+    torch.cuda.synchronize()
+    calls = max(1, min(16, runs, round(2e-3 / max(host, 1e-6))))
+    spin = int(min(0.02, 2.0 * calls * host + 1e-4) * CLOCK)
+    times = []
+    for _ in range(max(5, math.ceil(runs / calls))):
+        begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        torch.cuda._sleep(spin)
+        begin.record()
+        for _ in range(calls):
+            run()
+        end.record()
+        torch.cuda.synchronize()
+        times.append(begin.elapsed_time(end) / calls)
+    return statistics.median(times)
 
 
 def back(outputs: Tensor, inputs: Sequence[Tensor]) -> Run:
@@ -117,35 +149,44 @@ def cases(n: int, width: int, height: int) -> tuple[str, dict[str, Run]]:
     return counts, {name: torch.no_grad()(run) for name, run in forward.items()} | backward
 
 
-def kernels(parser: Arguments, words: Sequence[str]) -> None:
+def kernels(
+    surfels: tuple[int, ...] = (5_000, 20_000),
+    size: tuple[int, int] = (270, 480),
+    runs: int = 9,
+    output: Path | None = None,
+) -> None:
     """Time each CPU kernel on a scene like a trained one (`scenes.trained_like`), through `bitymi_ns.ops` as in
     training and rendering: medians after two warm-up runs. The baked scene has a uint8 atlas, a tile per surfel, a
-    texel per pixel."""
-    parser.add_argument("--surfels", nargs="+", type=int, default=[5_000, 20_000], help="sizes of the scene")
-    parser.add_argument("--size", type=image_size, default="270x480", metavar="WxH", help="(%(default)s)")
-    parser.add_argument("--runs", type=int, default=9, help="timed runs a kernel (%(default)s)")
-    parser.add_output()
-    options = parser.parse_args(words)
+    texel per pixel.
+
+    Args:
+        surfels: Sizes of the scene.
+        size: Width and height of the image.
+        runs: Timed runs of a kernel.
+        output: Also write the Markdown to this file.
+    """
     parts, load = [], os.getloadavg()[0]
-    for n in options.surfels:
-        counts, runs = cases(n, *options.size)
+    for n in surfels:
+        counts, prepared = cases(n, *size)
         rows = []
-        for name, run in runs.items():
-            wall, cpu = seconds(run, Options(CPU, WARM_UP, options.runs))
+        for name, run in prepared.items():
+            wall, cpu = seconds(run, runs)
             say(f"{n:,} surfels, {name}: {1e3 * wall:.2f} ms")
             rows.append([name, number(1e3 * wall), number(1e3 * cpu)])
-        title = f"### {n:,} surfels at {options.size[0]} x {options.size[1]}\n\n{counts}\n"
-        parts.append(title + "\n" + table(("kernel", "ms", "CPU ms"), rows))
-    notes = [
-        f"Median of {options.runs} runs; {torch.get_num_threads()} threads. Load average at the start: {load:.1f}: "
-        "other work on the machine spoils ms, CPU ms hardly."
-    ]
-    publish("CPU kernels", "\n\n".join(parts), notes, options.output)
+        parts += [f"### {n:,} surfels at {size[0]} x {size[1]}", counts, table(("kernel", "ms", "CPU ms"), rows)]
+    note = (
+        f"Median of {runs} runs; {torch.get_num_threads()} threads. Load average at the start: {load:.1f}: other "
+        "work on the machine spoils ms, CPU ms hardly."
+    )
+    publish(page("CPU kernels", "\n\n".join(parts), [note]), output)
 
 
-def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> dict[str, float]:
-    """Average over cameras of one size: pairs of surfel and tile, fragments, and the milliseconds of TIMED."""
-    size, graph = (cameras[0].width, cameras[0].height), options.device.type == "cuda"
+def frame_row(
+    name: str, scene: BakedScene, cameras: Sequence[Camera], milliseconds: Callable[[Run], float]
+) -> list[str]:
+    """Measure the cells of HEADER, means over cameras of one size. `milliseconds`: times a call."""
+    width, height = size = (cameras[0].width, cameras[0].height)
+    graph = scene.tiles.is_cuda
     sums = dict.fromkeys(("pairs", "fragments", *TIMED), 0.0)
     for camera in cameras:
         sums["fragments"] += float(scene.render_views([camera], None, ("overdraw",))["overdraw"].sum())
@@ -156,15 +197,9 @@ def measured(scene: BakedScene, cameras: Sequence[Camera], options: Options) -> 
             renderer.draw([camera])
         sums["pairs"] += frame.workspace.pairs
         stages = (partial(frame.run, Stage.LIST), partial(frame.run, Stage.DRAW), frame.run)
-        for name, run in zip(TIMED, (*stages, recorded.run, packed.run), strict=True):
-            sums[name] += device_milliseconds(run, options)
-    return {key: value / len(cameras) for key, value in sums.items()}
-
-
-def row(make: Callable[[], tuple[str, BakedScene, list[Camera]]], options: Options) -> list[str]:
-    """Measure the cells of HEADER."""
-    name, scene, cameras = make()
-    width, height, mean = cameras[0].width, cameras[0].height, measured(scene, cameras, options)
+        for stage, run in zip(TIMED, (*stages, recorded.run, packed.run), strict=True):
+            sums[stage] += milliseconds(run)
+    mean = {key: value / len(cameras) for key, value in sums.items()}
     say(f"{name} surfels, {width} x {height}: {mean['graph']:.3f} ms")
     fragments = number(mean["fragments"] / (width * height), 1)
     times = [number(mean[key], 3) for key in TIMED]
@@ -172,41 +207,55 @@ def row(make: Callable[[], tuple[str, BakedScene, list[Camera]]], options: Optio
     return [name, f"{width} x {height}", pairs, fragments, *times, number(1e3 / mean["graph"], 0)]
 
 
-def frames(parser: Arguments, words: Sequence[str]) -> None:
+def frames(
+    surfels: tuple[int, ...] = (50_000, 150_000, 500_000),
+    sizes: tuple[tuple[int, int], ...] = ((1297, 840), (1920, 1080), (3840, 2160)),
+    bundles: tuple[Path, ...] = (),
+    runs: int = 200,
+    emulated: bool = False,
+    output: Path | None = None,
+) -> None:
     """Time frames of baked scenes on a GPU and print a table.
 
-    Scenes: those of `scenes.textured`, and bundles (--bundles) with three cameras around their centre. "list" and
-    "draw" are the two stages of a frame, "frame" is both launched by the host, "graph" the same as a CUDA graph,
-    "packed" that with 8 bits per channel instead of floats. `--emulated` runs the kernels' host emulation on tiny
-    scenes, to try the script without a GPU; its times are meaningless.
+    Scenes: those of `scenes.textured`, and bundles with three cameras around their centre. "list" and "draw" are the
+    two stages of a frame, "frame" is both launched by the host, "graph" the same as a CUDA graph, "packed" that with 8
+    bits per channel instead of floats.
+
+    Args:
+        surfels: Sizes of the scenes.
+        sizes: Widths and heights of the images.
+        bundles: Baked scenes to draw as well.
+        runs: Timed frames, after ten untimed ones.
+        emulated: Try the script without a GPU: the kernels' host emulation on a tiny scene, whose times mean nothing.
+        output: Also write the Markdown to this file.
     """
-    parser.add_argument("--surfels", nargs="*", type=int, default=[50_000, 150_000, 500_000], help="of the scenes")
-    parser.add_argument("--sizes", nargs="+", type=image_size, default=SIZES, metavar="WxH", help="(%(default)s)")
-    parser.add_argument("--bundles", nargs="+", type=Path, default=[], help="baked scenes to draw as well")
-    parser.add_argument("--runs", type=int, default=200, help="timed frames, after ten untimed ones (%(default)s)")
-    parser.add_argument("--emulated", action="store_true", help="try the script without a GPU")
-    parser.add_output()
-    arguments = parser.parse_args(words)
-    surfels, sizes, options = [60], [(40, 24)], Options(CPU, 0, 1)
-    notes = ["No GPU: kernels emulated on the host, times mean nothing."]
-    if not arguments.emulated:
-        surfels, sizes, options = arguments.surfels, arguments.sizes, Options(parser.device(), 10, arguments.runs)
-        notes = [f"{torch.cuda.get_device_name(options.device)}, CUDA {torch.version.cuda}: medians, see `--help`."]
+    if emulated:
+        surfels, sizes, device = (60,), ((40, 24),), CPU
+        notes = ["No GPU: kernels emulated on the host, times mean nothing."]
+    else:
+        device = gpu()
+        notes = [f"{torch.cuda.get_device_name(device)}, CUDA {torch.version.cuda}: medians, see `--help`."]
 
-    def synthetic(n: int, width: int, height: int) -> tuple[str, BakedScene, list[Camera]]:
-        scene, camera = textured(n, width, height, options.device)
-        return f"synthetic, {n:,}", scene, [camera]
+    def milliseconds(run: Run) -> float:
+        return 1e3 * seconds(run, 1, 0)[0] if emulated else device_milliseconds(run, runs)
 
-    def bundled(folder: Path, width: int, height: int) -> tuple[str, BakedScene, list[Camera]]:
-        bundle = read_bundle(folder, decode=arguments.emulated)
-        return f"{folder.name}, {len(bundle):,}", bundle.scene.to(options.device), around(bundle, width, height)
+    def make(source: int | Path, width: int, height: int) -> tuple[str, BakedScene, list[Camera]]:
+        if isinstance(source, int):
+            scene, camera = textured(source, width, height, device)
+            return f"synthetic, {source:,}", scene, [camera]
+        bundle = read_bundle(source, decode=emulated)
+        return f"{source.name}, {len(bundle):,}", bundle.scene.to(device), around(bundle, width, height)
 
-    rows = Rows(HEADER)
-    with emulated_cuda() if arguments.emulated else nullcontext():
+    rows = []
+    with emulated_cuda() if emulated else nullcontext():
         for size in sizes:
-            for make, each in [(synthetic, n) for n in surfels] + [(bundled, folder) for folder in arguments.bundles]:
-                rows.add(f"{each}, {size[0]} x {size[1]}", partial(row, partial(make, each, *size), options))
-    publish("Frames of baked scenes", str(rows), notes, arguments.output)
+            for source in (*surfels, *bundles):
+                try:
+                    rows.append(frame_row(*make(source, *size), milliseconds))
+                except (RuntimeError, ValueError, OSError) as error:
+                    notes.append(f"Failed: {source}, {size[0]} x {size[1]}: {' '.join(str(error).split())[:400]}")
+                    say(notes[-1])
+    publish(page("Frames of baked scenes", table(HEADER, rows), notes), output)
 
 
 def baked(n: int, width: int, height: int, device: torch.device, every: bool = False) -> Run:
@@ -256,63 +305,82 @@ SECTIONS |= {"texels": partial(training, tiled=True), "listed": partial(training
 SECTIONS |= {"deterministic": exact}
 
 
-def cuda(parser: Arguments, words: Sequence[str]) -> None:
-    """Run each CUDA kernel once on a small scene, for sanitizers.
+def cuda(
+    surfels: int = 300,
+    size: tuple[int, int] = (96, 64),
+    sections: tuple[Literal["baked", "images", "training", "texels", "listed", "deterministic"], ...] = (),
+    times: int = 0,
+) -> None:
+    """Run each CUDA kernel once on a small scene, for sanitizers, or print its device time.
 
-    `--sections baked training` selects kernels; `--times RUNS` prints the device time by kernel.
+    Args:
+        surfels: Size of the scene.
+        size: Width and height of the image.
+        sections: Select kernels; none = all.
+        times: Time by kernel over so many runs.
     """
-    parser.add_argument("--surfels", type=int, default=300)
-    parser.add_argument("--size", type=image_size, default="96x64", metavar="WxH", help="image size (%(default)s)")
-    parser.add_argument("--sections", nargs="*", choices=list(SECTIONS), default=list(SECTIONS))
-    parser.add_argument("--times", type=int, default=0, metavar="RUNS", help="time by kernel over so many runs")
-    arguments = parser.parse_args(words)
-    device = parser.device()
-    for name in arguments.sections:
-        run = SECTIONS[name](arguments.surfels, *arguments.size, device)
-        if arguments.times:
-            print_times(name, run, arguments.times)
-        else:
-            run()
-            torch.cuda.synchronize()
-            print(f"{name}: done", flush=True)
-
-
-def print_times(name: str, run: Run, runs: int) -> None:
-    """Print the device time per run of each kernel after a warm-up, longest first."""
-    for _ in range(5):
-        run()
-    torch.cuda.synchronize()
+    device = gpu()
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
-    with torch.profiler.profile(activities=activities) as profile:
-        for _ in range(runs):
+    for name in sections or SECTIONS:
+        run = SECTIONS[name](surfels, *size, device)
+        for _ in range(5 if times else 1):
             run()
         torch.cuda.synchronize()
-    kernels = [e for e in profile.key_averages() if e.device_type == torch.autograd.DeviceType.CUDA]
-    total = sum(e.self_device_time_total for e in kernels) / runs
-    print(f"\n#### {name}: {total:.0f} us on the device per run, {sum(e.count for e in kernels) / runs:.0f} kernels\n")
-    longest = sorted(kernels, key=lambda e: -e.self_device_time_total)[:45]
-    rows = [(f"`{e.key[:90]}`", f"{e.count / runs:.1f}", f"{e.self_device_time_total / runs:.1f}") for e in longest]
-    print(table(("kernel", "per run", "us per run"), rows))
+        print(f"{name}: done", flush=True)
+        if times:
+            with torch.profiler.profile(activities=activities) as profile:
+                for _ in range(times):
+                    run()
+                torch.cuda.synchronize()
+            print(f"\n{name}, {times} runs:")
+            print(profile.key_averages().table("self_device_time_total", row_limit=45, max_name_column_width=90))
 
 
-COMMANDS = {"kernels": kernels, "frames": frames, "cuda": cuda}
-MODULES = {"peers": "gpu_peers", "nerfstudio": "gpu_nerfstudio"}  # import much else
+def nerfstudio(
+    data: tyro.conf.Positional[Path], folder: Path, steps: int = 3000, options: str = "", output: Path | None = None
+) -> int:
+    """Run nerfstudio's commands on a capture and tabulate their cost: train, resume, evaluate, export, evaluate and
+    render the bundle. Returns 1 if one fails, which ends the others.
 
-
-def main() -> int:
-    """Run the command that the command line names."""
-    command, *words = sys.argv[1:] or [""]
-    if command not in (*COMMANDS, *MODULES):
-        print(__doc__)
-        return 0 if command in ("-h", "--help") else 2
-    if command in MODULES:
-        module = import_module(MODULES[command])
-        run, text = module.main, module.__doc__
-    else:
-        run = COMMANDS[command]
-        text = cleandoc(run.__doc__ or "")
-    return run(Arguments(text, f"times.py {command}"), words) or 0
+    Args:
+        data: Folder of a capture.
+        folder: Folder of runs, bundle and logs; emptied first.
+        steps: Length of the run.
+        options: Further options of ns-train, as one word.
+        output: Also write the Markdown to this file.
+    """
+    folder, half, run = folder.resolve(), max(1, steps // 2), "outputs/capture/bitymi/whole"
+    shutil.rmtree(folder, ignore_errors=True)
+    train = ["ns-train", "bitymi", "--data", str(data.resolve()), "--max-num-iterations", str(steps)]
+    train += "--output-dir outputs --experiment-name capture --vis tensorboard --timestamp".split()
+    kept = f"--steps-per-save {half} --save-only-latest-checkpoint False".split()
+    checkpoint = f"--load-dir {run}/nerfstudio_models --load-step {half}".split()
+    bundle = "--load-config bundle/config.yml"
+    commands = [
+        [*train, "whole", *kept, *shlex.split(options)],
+        [*train, "resumed", *checkpoint, *shlex.split(options)],
+        f"ns-eval --load-config {run}/config.yml --output-path trained.json".split(),
+        f"ns-export bitymi-atlas --load-config {run}/config.yml --output-dir bundle".split(),
+        f"ns-eval {bundle} --output-path baked.json".split(),
+        f"ns-render dataset {bundle} --output-path maps --rendered-output-names rgb depth".split(),
+    ]
+    rows = []
+    try:
+        for i, command in enumerate(commands):
+            cost = run_measured([tool(command[0]), *command[1:]], folder / f"{i}.log", cwd=folder)
+            costs = (cost["process_seconds"], cost["process_cpu_seconds"], cost["peak_bytes"] / 1e6)
+            rows.append([f"`{shlex.join(command)}`", *(number(figure, 0) for figure in costs)])
+            say(rows[-1][0])
+    except CommandFailed as error:
+        say(str(error))
+    finally:  # an interrupted run leaves its results
+        found = [file for file in (folder / "trained.json", folder / "baked.json") if file.is_file()]
+        quality = quality_markdown(collect(found, folder).evaluations) if found else ""
+        costs = table(("command", "s", "CPU s", "MB"), rows)
+        publish(page(f"nerfstudio on {data.resolve().name}, {steps} steps", f"{costs}\n\n{quality}"), output)
+    return 0 if len(rows) == len(commands) else 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    commands = {"kernels": kernels, "frames": frames, "cuda": cuda, "nerfstudio": nerfstudio}
+    sys.exit(tyro.extras.subcommand_cli_from_dict(commands, description=__doc__))

@@ -2,59 +2,52 @@
 
 import io
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
 from matplotlib import style
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-PLAIN = ("default", {"text.parse_math": False})
-"""Overrides a matplotlibrc in the current folder, which may enable LaTeX. Names may contain a $."""
-INK, GRID = "#26292e", "#e3e5e8"
+INK = "#26292e"
 COLORS = (
     "#0b62b8", "#d1540b", "#1a8a5a", "#a8358f", "#8a6d00", "#128a9e", "#c22f3d", "#5b4bc4", "#6b6f76", "#4f7a14",
 )  # fmt: skip
+SETTINGS = {
+    "text.parse_math": False,  # names may contain a $
+    "axes.grid": True, "grid.color": "#e3e5e8", "grid.linewidth": 0.8, "axes.axisbelow": True,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.titlesize": 9, "axes.labelsize": 9,
+    "xtick.labelsize": 8, "ytick.labelsize": 8, "xtick.major.size": 3, "ytick.major.size": 3, "xtick.minor.size": 3,
+    "ytick.minor.size": 3, "legend.frameon": False, "legend.fontsize": 8, "figure.constrained_layout.use": True,
+}  # fmt: skip
+styled = style.context(("default", SETTINGS))
+"""Decorator of functions that draw. Overrides a matplotlibrc in the current folder, which may enable LaTeX."""
 NUMBERS = FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}")
 
 
-class Panel(NamedTuple):
-    """A function that draws a panel, its title and axes."""
-
-    draw: Callable[[Axes], None]
-    title: str
-    x: str
-    y: str
-
-
-@style.context(PLAIN)
-def png(panels: Sequence[Panel], legend: Sequence[Line2D] = (), most: int = 3) -> bytes:
-    """Draw panels, at most `most` per row, with one legend below."""
-    columns = min(most, len(panels))
-    rows = math.ceil(len(panels) / columns)
+def panels(titles: Sequence[str], x: str, y: str, most: int = 3) -> tuple[Figure, list[Axes]]:
+    """Create a figure with a panel for each title, which one panel alone does not show, at most `most` per row. `x`,
+    `y`: labels of the axes."""
+    columns = min(most, len(titles))
+    rows = math.ceil(len(titles) / columns)
     width, height = (6.4, 3.9) if columns == 1 else (3.5 * columns, 2.9)
-    figure = Figure(figsize=(width, rows * height), dpi=160 if columns < 4 else 100, layout="constrained")
-    FigureCanvasAgg(figure)
-    for i, panel in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, i + 1)
-        panel.draw(axes)
+    figure = Figure(figsize=(width, rows * height), dpi=160 if columns < 4 else 100)
+    axes = [figure.add_subplot(rows, columns, i + 1, xlabel=x, ylabel=y) for i in range(len(titles))]
+    for panel, title in zip(axes, titles if len(titles) > 1 else [""], strict=True):
+        panel.set_title(title)
+    return figure, axes
+
+
+def png(figure: Figure, legend: Sequence[Line2D] = ()) -> bytes:
+    """Encode a figure with one legend below its panels."""
+    for axes in figure.axes:
         axes.xaxis.set_major_formatter(NUMBERS)
         axes.yaxis.set_major_formatter(NUMBERS)
-        axes.grid(True, color=GRID, linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.tick_params(labelsize=8, length=3, which="both")
-        axes.spines[["top", "right"]].set_visible(False)
-        if len(panels) > 1:
-            axes.set_title(panel.title, fontsize=9)
-        axes.set_xlabel(panel.x, fontsize=9)
-        axes.set_ylabel(panel.y, fontsize=9)
     if len(legend) > 1:
         longest = max(len(str(handle.get_label())) for handle in legend)
-        ncols = max(1, min(len(legend), int(width * 16) // (longest + 7)))
-        figure.legend(handles=legend, loc="outside lower center", frameon=False, fontsize=8, ncols=ncols)
+        ncols = max(1, min(len(legend), int(figure.get_figwidth() * 16) // (longest + 7)))
+        figure.legend(handles=legend, loc="outside lower center", ncols=ncols)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": "bitymi report"})
     return buffer.getvalue()

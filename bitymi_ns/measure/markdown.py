@@ -7,11 +7,14 @@ import shlex
 import sys
 from collections.abc import Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
+from bitymi_ns.files import write_errors_as, write_file
 from bitymi_ns.measure.machine import commit, machine, versions
+from bitymi_ns.trust import printable
 
 
 def escaped(text: str) -> str:
@@ -44,6 +47,14 @@ def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str
     if notes:
         lines += ["", *(f"- {note}" for note in notes)]
     return "\n".join(lines) + "\n"
+
+
+def publish(text: str, output: Path | None) -> None:
+    """Print a page, and write it to a file. Raises ValueError: it cannot be written."""
+    print(printable(text))
+    if output is not None:
+        with write_errors_as(output, ValueError):
+            write_file(output, text.encode("utf8"), follow=True)
 
 
 @lru_cache

@@ -38,7 +38,7 @@ def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.M
     (scene,) = standard_scenes("mipnerf360", tmp_path / "360", ["bonsai"])
     run = CellSpec(scene, MethodSpec("small", "bitymi", SMALL), seed=3, steps=2)
     path = train(tmp_path / "work", run, monkeypatch)
-    _, (curve,), _ = read_jsonl(path.with_name(CURVE))
+    (curve,) = read_jsonl(path.with_name(CURVE)).curves
     assert curve.scene == "bonsai"
     config, pipeline, _, _ = eval_setup(path, test_mode="test")
     assert config.machine.seed == config.pipeline.model.train.seed == 3

@@ -1,43 +1,24 @@
 """Files and commands for a bare machine with a GPU."""
 
-import json
 import os
 import re
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-USE = """
-import open3d.geometry
-from gsplat.strategy import DefaultStrategy
-class Kept(DefaultStrategy):
-    mesh: open3d.geometry.TriangleMesh | None = None
-import tensorly
-tensorly.set_backend("pytorch")
-try:
-    open3d.io.read_point_cloud("points.ply")
-except RuntimeError as error:
-    print(error)
-"""
+import pytest
 
 
-def test_stand_ins_are_imported_and_their_use_is_an_error(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
-    environment = load("gpu_nerfstudio").stand_in(tmp_path)
-    done = subprocess.run([sys.executable, "-c", USE], env=environment, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "open3d.io.read_point_cloud is a stand-in: the package is not on this machine"
-
-
-def test_commands_are_tabled_with_what_they_left(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
-    card = load("gpu_nerfstudio")
-    environment, costs = card.stand_in(tmp_path / "stand-ins"), card.Rows(("command", "s", "host", "card"))
-    assert card.run([sys.executable, "-c", "x = bytearray(200_000_000)"], tmp_path, environment, costs)
-    assert not card.run([sys.executable, "-c", "raise SystemExit(3)"], tmp_path, environment, costs)
-    assert float(costs.cells[0][2].replace(",", "")) > 200 and "| failed |  |" in str(costs)
-    (tmp_path / "baked.json").write_text(json.dumps({"results": {"psnr": 28.149, "lpips": 0.08}}))
-    assert "| baked | 28.15 |  | 0.080 |  |" in card.quality(tmp_path)
+@pytest.mark.parametrize(("program", "status"), [("true", 0), ("false", 1)])
+def test_nerfstudios_commands_are_tabled(
+    load: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, program: str, status: int
+) -> None:
+    times, page = load("times"), tmp_path / "page.md"
+    monkeypatch.setattr(times, "tool", lambda name: program)
+    assert times.nerfstudio(tmp_path / "fox", tmp_path / "runs", steps=4, output=page) == status
+    assert page.read_text("utf8").count("| `ns-") == (0 if status else 6)
 
 
 def test_wheels_are_parted_by_size(load: Callable[[str], ModuleType], tmp_path: Path) -> None:

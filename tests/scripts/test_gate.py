@@ -1,7 +1,6 @@
 """The gate: what passes and what fails."""
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -25,8 +24,7 @@ def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *meas
     """Run the gate on given measurements; returns how many it used."""
     left = [{"room": {**GOOD, **change}} for change in measured]
     monkeypatch.setattr(gate, "measure", lambda *_: left.pop(0))
-    monkeypatch.setattr(sys, "argv", ["gate.py", "--baseline", str(baseline), *(["--accept"] if accept else [])])
-    gate.main()
+    gate.main(baseline=baseline, accept=accept)
     return len(measured) - len(left)
 
 

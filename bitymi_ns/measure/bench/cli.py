@@ -3,15 +3,13 @@
 import os
 import shlex
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
 import tyro
 
-from bitymi_ns.files import check_writable, write_errors_as, write_file
-from bitymi_ns.measure import markdown
+from bitymi_ns.files import check_writable, write_errors_as
 from bitymi_ns.measure.bench.cells import FILE, Cells
 from bitymi_ns.measure.bench.engine import run_chains
 from bitymi_ns.measure.bench.matrix import (
@@ -25,6 +23,7 @@ from bitymi_ns.measure.bench.matrix import (
     standard_scenes,
 )
 from bitymi_ns.measure.bench.process import BenchError, say
+from bitymi_ns.measure.markdown import page, publish
 from bitymi_ns.measure.report.read import add_cells
 from bitymi_ns.measure.report.records import Records
 from bitymi_ns.measure.report.tables import NOTES, quality_markdown
@@ -91,23 +90,12 @@ class BenchRun:
         for failure in failures:
             say(failure)
         cells.refresh()
-        text = results_page(f"Benchmark: {self.plan or self.suite}", runs, cells, failures)
-        print(printable(text))
-        if self.output is not None:
-            with write_errors_as(self.output, BenchError):
-                write_file(self.output, text.encode("utf8"), follow=True)
-        kept = (
-            f"Cells: {cells.path}. A page of it: bitymi report {cells.path}" if len(cells) else "No cell was finished."
-        )
-        print(printable(kept), file=sys.stderr)
+        finished, records = [cell for chain in runs for spec in chain if (cell := cells.get(spec.key))], Records()
+        add_cells(finished, cells.path, records)
+        failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
+        commits = [cell["made"]["commit"] for cell in finished]
+        tables = quality_markdown(records.evaluations)
+        publish(page(f"Benchmark: {self.plan or self.suite}", tables, [NOTES, *failed], commits), self.output)
+        kept = f"Cells: {cells.path}. A page of it: bitymi report {cells.path}"
+        print(printable(kept if len(cells) else "No cell was finished."), file=sys.stderr)
         return FAILED if failures else 0
-
-
-def results_page(title: str, runs: Sequence[Chain], cells: Cells, failures: Sequence[str]) -> str:
-    """Format the quality tables of the finished cells of runs as Markdown."""
-    found = [found for chain in runs for cell in chain if (found := cells.get(cell.key)) is not None]
-    records = Records()
-    add_cells(found, cells.path, records)
-    failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
-    commits = [cell["made"]["commit"] for cell in found]
-    return markdown.page(title, quality_markdown(records.evaluations), [NOTES, *failed], commits)

@@ -118,10 +118,11 @@ class CellSpec:
         return Path("evals", self.folder, self.form)
 
     @property
-    def source(self) -> Path:
-        """Path in the work folder of the config.yml that is evaluated or exported."""
-        baked = self.kind == "eval" and self.bundle is not None
-        return replace(self, kind="export" if baked else "train").output / "config.yml"
+    def parent(self) -> "CellSpec":
+        """The cell whose config.yml this one uses; the training itself for the training."""
+        if self.kind == "eval" and self.bundle is not None:
+            return replace(self, kind="export")
+        return replace(self, kind="train", bundle=None)
 
     @property
     def run(self) -> str:

@@ -7,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from bitymi_ns.locks import Lock
@@ -26,11 +26,7 @@ class CommandFailed(BenchError):
 
 
 def run_measured(
-    command: Sequence[str],
-    log: Path,
-    lock: Lock | None = None,
-    cwd: Path | None = None,
-    env: Mapping[str, str] = os.environ,
+    command: Sequence[str], log: Path, lock: Lock | None = None, cwd: Path | None = None
 ) -> dict[str, float]:
     """Run a command with its output in a file; an interrupt terminates the command first.
 
@@ -39,7 +35,7 @@ def run_measured(
     Args:
         lock: inherited by the command and labelled with its process, so that it stays locked if only this process is
             killed.
-        cwd, env: working folder and environment of the command; default: those of this process.
+        cwd: working folder of the command; default: that of this process.
 
     Returns:
         `process_seconds`, `process_cpu_seconds` and `peak_bytes` of the command with all threads and children.
@@ -54,7 +50,7 @@ def run_measured(
             process = subprocess.Popen(
                 command,
                 cwd=cwd,
-                env={**env, "OMP_WAIT_POLICY": "passive"},
+                env={**os.environ, "OMP_WAIT_POLICY": "passive"},
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,

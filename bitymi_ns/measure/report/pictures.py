@@ -90,8 +90,8 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
     """
     folders: dict[Path, dict[int, View]] = {}
     for path in sorted(p.resolve() for p in images):
+        match = SIDE_BY_SIDE.match(path.stem)
         try:
-            match = SIDE_BY_SIDE.match(path.stem)
             if match is None:
                 raise OSError("its name is not eval_img_ with a number, as ns-eval names a photograph beside a render")
             photograph, render = _halves(path)

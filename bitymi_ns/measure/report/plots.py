@@ -1,26 +1,21 @@
 """Plots of a report: training curves, and quality against cost with Pareto fronts; one panel per scene."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from bitymi_ns.measure.figure import COLORS, INK, Panel, log_when_wide, png
+from bitymi_ns.measure.figure import COLORS, INK, log_when_wide, panels, png, styled
 from bitymi_ns.measure.report.records import Curve, Evaluation
 
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Markers of bundles, one per format."""
-HOLLOW: dict[str, Any] = {
-    "marker": "o",
-    "ms": 7,
-    "markerfacecolor": "white",
-    "markeredgewidth": 1.8,
-}  # of trained scenes
+HOLLOW: dict[str, Any] = {"marker": "o", "ms": 7, "markerfacecolor": "white", "markeredgewidth": 1.8}
+"""Marker of trained scenes."""
 DASHES: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 3))}  # of Pareto fronts
-TRAINING, RENDERING, SIZE = "Error against training time", "Error against rendering time", "Error against size"
+TRAINING = "Error against training time"
 CURVES = (
     ("PSNR in the course of training", "training seconds", "PSNR (dB)", ("seconds", "psnr")),
     ("PSNR by CPU seconds of training", "CPU seconds", "PSNR (dB)", ("cpu_seconds", "psnr")),
@@ -57,13 +52,13 @@ class Cost(NamedTuple):
 
     def value(self, row: Evaluation) -> float | None:
         """Return the cost of an evaluation; None if it is unknown or 0."""
-        return (row.results.get(self.key) or 0.0) * self.factor or None
+        return row.results.get(self.key, 0.0) * self.factor or None
 
 
 COSTS = (
     Cost("training seconds", TRAINING, "train_seconds"),
-    Cost("milliseconds per view", RENDERING, "render_ms"),
-    Cost("bundle MB", SIZE, "bundle_bytes", 1e-6),
+    Cost("milliseconds per view", "Error against rendering time", "render_ms"),
+    Cost("bundle MB", "Error against size", "bundle_bytes", 1e-6),
 )
 
 
@@ -77,6 +72,7 @@ def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, 
     return best
 
 
+@styled
 def draw_plots(evaluations: list[Evaluation], curves: list[Curve]) -> list[Plot]:
     """Draw all plots that have a panel with at least MIN_POINTS points."""
     names = dict.fromkeys([*sorted({e.method for e in evaluations}), *sorted({c.label for c in curves})])
@@ -84,10 +80,6 @@ def draw_plots(evaluations: list[Evaluation], curves: list[Curve]) -> list[Plot]
     plots = [curve_plot(*axes, curves, colors) for axes in CURVES]
     plots += [pareto_plot(key, cost, evaluations, colors) for cost in COSTS for key in METRICS]
     return [plot for plot in plots if plot is not None]
-
-
-def _panels(scenes: set[str], draw: Callable[[str, Axes], None], x: str, y: str) -> list[Panel]:
-    return [Panel(partial(draw, scene), scene or "no scene named", x, y) for scene in sorted(scenes)]
 
 
 def curve_plot(
@@ -98,19 +90,16 @@ def curve_plot(
     lines = [line for line in lines if line[1]]
     if max((len(xs) for _, xs, _ in lines), default=0) < MIN_POINTS:
         return None
-
-    def panel(scene: str, axes: Axes) -> None:
-        for curve, xs, ys in lines:
-            if curve.scene == scene:
-                marker = "o" if len(xs) <= 20 else ""
-                axes.plot(xs, ys, color=colors[curve.label], linewidth=1.6, marker=marker, ms=3)
+    scenes = sorted({curve.scene for curve, *_ in lines})
+    figure, axes = panels([scene or "no scene named" for scene in scenes], x, y)
+    for curve, xs, ys in lines:
+        marker, panel = "o" if len(xs) <= 20 else "", axes[scenes.index(curve.scene)]
+        panel.plot(xs, ys, color=colors[curve.label], linewidth=1.6, marker=marker, ms=3)
         if keys[1] == "surfels":
-            axes.set_ylim(bottom=0)
-
+            panel.set_ylim(bottom=0)
     labels = sorted({curve.label for curve, *_ in lines})
-    panels = _panels({curve.scene for curve, *_ in lines}, panel, x, y)
-    picture = png(panels, [Line2D([], [], color=colors[label], label=label) for label in labels])
-    return Plot(title, TRAINING, len(panels), picture)
+    legend = [Line2D([], [], color=colors[label], label=label) for label in labels]
+    return Plot(title, TRAINING, len(scenes), png(figure, legend))
 
 
 def pareto_panel(
@@ -119,28 +108,26 @@ def pareto_panel(
     """Draw quality against cost of one scene: hollow circles for trained scenes, filled markers for bundles, a line per
     method, and the Pareto front of all points."""
     _, up, span = METRICS[key]
-    costs = {id(e): cost.value(e) for e in rows}
-    points = {id(e): (x, e.results[key]) for e in rows if (x := costs[id(e)]) is not None}
-    best = front(list(points.values()), up)
+    points = [(x, e.results[key]) for e in rows if (x := cost.value(e)) is not None]
+    best = front(points, up)
     if len(best) > 1:
         axes.step(*zip(*best, strict=True), where="post", color=INK, alpha=0.6, zorder=1, **DASHES)
     for method in sorted({e.method for e in rows}):
-        line = sorted(points[id(e)] for e in rows if e.method == method)
+        line = sorted(point for e, point in zip(rows, points, strict=True) if e.method == method)
         axes.plot(*zip(*line, strict=True), color=colors[method], linewidth=0.9, alpha=0.55, zorder=2)
-    for e in rows:
+    for e, (x, y) in zip(rows, points, strict=True):
         mark = {"marker": markers[_variant(e)], "ms": 6} if e.baked else HOLLOW
-        x, y = points[id(e)]
         axes.plot([x], [y], color=colors[e.method], linestyle="", zorder=3, **mark)
     axes.margins(0.12)
-    low, high = (f(y for _, y in points.values()) for f in (min, max))
+    low, high = (f(y for _, y in points) for f in (min, max))
     if high - low < span:  # do not exaggerate differences in the third decimal
         axes.set_ylim((low + high) / 2 - 0.6 * span, (low + high) / 2 + 0.6 * span)
-    log_when_wide(axes, [x for x, _ in points.values()])
+    log_when_wide(axes, [x for x, _ in points])
 
 
 def pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: dict[str, str]) -> Plot | None:
     """Draw quality against cost, a panel per scene; None if no scene has enough points."""
-    drawn = [e for e in evaluations if cost.value(e) is not None and e.results.get(key) is not None]
+    drawn = [e for e in evaluations if cost.value(e) is not None and key in e.results]
     if max(Counter(e.scene for e in drawn).values(), default=0) < MIN_POINTS:
         return None
     variants = sorted({_variant(e) for e in drawn if e.baked})
@@ -152,13 +139,12 @@ def pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: dic
     names = {variant: f"baked, {variant}" if variant else "baked" for variant in variants}
     legend += [Line2D([], [], marker=markers[v], ms=6, label=name, **mark) for v, name in names.items()]
     legend.append(Line2D([], [], color=INK, label="Pareto front: no point is better in both", **DASHES))
-
-    def panel(scene: str, axes: Axes) -> None:
-        pareto_panel(axes, [e for e in drawn if e.scene == scene], key, cost, colors, markers)
-
-    title = f"{METRICS[key][0].removesuffix(' (dB)')} against {cost.label}"
-    panels = _panels({e.scene for e in drawn}, panel, cost.label, METRICS[key][0])
-    return Plot(title, cost.section, len(panels), png(panels, legend))
+    scenes, quality = sorted({e.scene for e in drawn}), METRICS[key][0]
+    figure, axes = panels(scenes, cost.label, quality)
+    for panel, scene in zip(axes, scenes, strict=True):
+        pareto_panel(panel, [e for e in drawn if e.scene == scene], key, cost, colors, markers)
+    title = f"{quality.removesuffix(' (dB)')} against {cost.label}"
+    return Plot(title, cost.section, len(scenes), png(figure, legend))
 
 
 def _variant(row: Evaluation) -> str:

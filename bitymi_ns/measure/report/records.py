@@ -1,7 +1,7 @@
 """Records of a report and the links between them: evaluations, training curves."""
 
 import statistics
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,10 +26,8 @@ class Evaluation:
     label: str  # for tables, unique within its scene and stage after `disambiguate`
     results: dict[str, float]  # finite numbers by name (psnr, ssim, render_ms, bundle_bytes, ...)
     source: Path  # file it was read from
-    run: str = ""  # identity of the training run, empty if unknown (a bare ns-eval file)
     group: str = ""  # label without the seed; empty: not grouped over seeds
-    series: str = ""  # run without the seed
-    seed: int | None = None  # of the training, None if not stated
+    series: str = ""  # identity of the training run without its seed
 
 
 @dataclass(frozen=True)
@@ -80,17 +78,21 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
 
 
 def link(records: Records) -> None:
-    """Link records: make labels unique, and add missing training times to evaluations from the only curve of their
-    scene and method."""
+    """Link records: make labels unique, and add to evaluations of files the training times of the only curve of their
+    scene and method, and to bundles the difference from their trained scene (`psnr_delta`)."""
     disambiguate(records.evaluations)
     disambiguate(records.curves)
     for i, row in enumerate(records.evaluations):
-        curves = [c for c in records.curves if (c.scene, c.label) == (row.scene, row.method)]
-        if "train_seconds" in row.results or len(curves) != 1:
+        if row.series:  # of a benchmark, which states both
             continue
-        times = {f"train_{key}": curves[0].last(key) for key in ("seconds", "cpu_seconds")}
-        known = {key: value for key, value in times.items() if value is not None}
-        records.evaluations[i] = replace(row, results={**row.results, **known})
+        known: dict[str, float | None] = {}
+        curves = [c for c in records.curves if (c.scene, c.label) == (row.scene, row.method)]
+        if len(curves) == 1:
+            known = {f"train_{key}": curves[0].last(key) for key in ("seconds", "cpu_seconds")}
+        parent = trained_parent(row, records.evaluations)
+        if parent is not None and "psnr" in row.results and "psnr" in parent.results:
+            known["psnr_delta"] = row.results["psnr"] - parent.results["psnr"]
+        records.evaluations[i] = replace(row, results=finite_numbers(known) | row.results)
 
 
 def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
@@ -101,46 +103,29 @@ def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
     return groups
 
 
-def mean_results(rows: Sequence[Evaluation]) -> dict[str, float]:
-    """Average the results that all of the evaluations have."""
-    keys = set.intersection(*(set(row.results) for row in rows))
-    return {key: statistics.fmean(row.results[key] for row in rows) for key in sorted(keys)}
+def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Average the figures that all rows have, by name."""
+    names = sorted(set.intersection(*map(set, rows)))
+    return {name: statistics.fmean(row[name] for row in rows) for name in names}
 
 
 def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
-    """Average runs that differ only in their seed; `psnr_seeds` is the standard deviation of their PSNR.
-
-    `psnr_delta` of bundles, their PSNR minus that of the trained scene, is computed per run before averaging.
-    """
+    """Average runs that differ only in their seed; `psnr_seeds` is the standard deviation of their PSNR."""
     merged = []
-    for rows in grouped(with_deltas(evaluations), lambda row: (row.scene, row.baked, row.group, row.series)).values():
+    for rows in grouped(evaluations, lambda row: (row.scene, row.baked, row.group, row.series)).values():
         if len(rows) == 1 or not rows[0].group:
             merged += rows
             continue
-        means = mean_results(rows)
-        if "psnr" in means:
-            means["psnr_seeds"] = statistics.stdev(row.results["psnr"] for row in rows)
-        label = f"{rows[0].group} ({len(rows)} seeds)"
-        merged.append(replace(rows[0], label=label, results=means, run=rows[0].series, seed=None))
+        spread = statistics.stdev(row.results["psnr"] for row in rows)
+        results = means([row.results for row in rows]) | {"psnr_seeds": spread}
+        merged.append(replace(rows[0], label=f"{rows[0].group} ({len(rows)} seeds)", results=results))
     return merged
 
 
-def with_deltas(evaluations: list[Evaluation]) -> list[Evaluation]:
-    """Add `psnr_delta` to the results of bundles whose trained scene is known."""
-    rows = []
-    for row in evaluations:
-        parent = trained_parent(row, evaluations)
-        if parent is not None and "psnr" in row.results and "psnr" in parent.results:
-            delta = {"psnr_delta": row.results["psnr"] - parent.results["psnr"]}
-            row = replace(row, results=delta | row.results)
-        rows.append(row)
-    return rows
-
-
 def trained_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
-    """Find the evaluation of a bundle's trained scene: of the same scene, method and run; if there are several, the one
+    """Find the evaluation of a bundle's trained scene: of the same scene and method; if there are several, the one
     whose file is in the same folder. None if ambiguous."""
-    same = [e for e in evaluations if not e.baked and (e.scene, e.method, e.run) == (row.scene, row.method, row.run)]
+    same = [e for e in evaluations if not (e.baked or e.series) and (e.scene, e.method) == (row.scene, row.method)]
     if len(same) > 1:
         same = [e for e in same if e.source.parent == row.source.parent]
     return same[0] if row.baked and len(same) == 1 else None

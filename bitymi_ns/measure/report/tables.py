@@ -1,32 +1,29 @@
 """Tables of a report; their HTML is in templates/report.html.j2."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.markdown import escaped
-from bitymi_ns.measure.report.records import Evaluation, grouped, mean_results, with_deltas
+from bitymi_ns.measure.report.records import Evaluation, grouped, means
 
 MISSING = "–"
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """A row of strings; `best` are the columns in which it has the table's best value. A section row has one cell."""
 
-    cells: tuple[str, ...]
-    best: frozenset[int] = frozenset()
-    section: bool = False
+    cells: list[str]
+    best: set[int]
 
 
-@dataclass(frozen=True)
-class Table:
+class Table(NamedTuple):
     """A titled table of names (first column) and numbers."""
 
     title: str
-    header: tuple[str, ...]
-    rows: tuple[Row, ...]
+    header: Sequence[str]
+    rows: Sequence[Row]
     note: str = ""
 
 
@@ -42,6 +39,11 @@ class Column(NamedTuple):
     def heading(self) -> str:
         """Title with an arrow for the better direction, as in the paper."""
         return self.title + {"up": " ↑", "down": " ↓", None: ""}[self.better]
+
+    def value(self, row: Evaluation) -> float | None:
+        """Return the figure of an evaluation if it has one that applies: of the training for trained scenes, of an
+        atlas for bundles."""
+        return None if self.key.startswith("train_" if row.baked else "atlas_") else row.results.get(self.key)
 
 
 def significant(value: float) -> str:
@@ -100,34 +102,25 @@ NOTES = (
 )
 
 
-def applicable(row: Evaluation) -> Evaluation:
-    """Drop the results that do not apply: of the training for bundles, of an atlas for trained scenes."""
-    other = "train_" if row.baked else "atlas_"
-    return replace(row, results={key: value for key, value in row.results.items() if not key.startswith(other)})
-
-
 def scene_table(title: str, evaluations: list[Evaluation], columns: Sequence[Column], note: str = "") -> Table:
     """Build the table of one scene: a section of trained scenes, then one of bundles, with the best values of each
     column marked unless all are equal."""
-    columns = [column for column in columns if any(column.key in row.results for row in evaluations)]
     ordered = sorted(evaluations, key=lambda row: (row.baked, row.label))
-    best: list[set[int]] = [set() for _ in ordered]
-    texts = [[row.label for row in ordered]]
-    for j, column in enumerate(columns, 1):
-        values = [row.results.get(column.key) for row in ordered]
-        texts.append([MISSING if value is None else column.text(value) for value in values])
+    figures = {column: [column.value(row) for row in ordered] for column in columns}
+    figures = {column: values for column, values in figures.items() if any(value is not None for value in values)}
+    rows = [Row([row.label], set()) for row in ordered]
+    for j, (column, values) in enumerate(figures.items(), 1):
+        texts = [MISSING if value is None else column.text(value) for value in values]
         known = [value for value in values if value is not None]
-        if column.better and len({*texts[j]} - {MISSING}) > 1:
-            top = column.text(max(known) if column.better == "up" else min(known))
-            for i, text in enumerate(texts[j]):
-                if text == top:  # compared as printed, so that equal figures are marked alike
-                    best[i].add(j)
-    rows: list[Row] = []
-    for i, (row, cells) in enumerate(zip(ordered, zip(*texts, strict=True), strict=True)):
-        if i == 0 or row.baked != ordered[i - 1].baked:
-            rows.append(Row((STAGES[row.baked],), section=True))
-        rows.append(Row(cells, frozenset(best[i])))
-    return Table(title, ("Method", *(column.heading for column in columns)), tuple(rows), note)
+        top = column.text(max(known) if column.better == "up" else min(known))
+        marked = column.better and len({*texts} - {MISSING}) > 1
+        for row, text in zip(rows, texts, strict=True):
+            row.cells.append(text)
+            if marked and text == top:  # compared as printed, so that equal figures are marked alike
+                row.best.add(j)
+    parts = grouped(zip(ordered, rows, strict=True), lambda pair: pair[0].baked)
+    sections = [[Row([STAGES[baked]], set()), *(row for _, row in pairs)] for baked, pairs in parts.items()]
+    return Table(title, ["Method", *(column.heading for column in figures)], sum(sections, []), note)
 
 
 def over_scenes(evaluations: list[Evaluation]) -> tuple[list[Evaluation], list[str]]:
@@ -139,32 +132,32 @@ def over_scenes(evaluations: list[Evaluation]) -> tuple[list[Evaluation], list[s
     covers = {key: {row.scene for row in rows} for key, rows in groups.items()}
     widest = max(covers.values(), key=len, default=set())
     kept = [rows for key, rows in groups.items() if covers[key] == widest]
-    return [replace(rows[0], results=mean_results(rows)) for rows in kept], sorted(widest)
+    return [replace(rows[0], results=means([row.results for row in rows])) for rows in kept], sorted(widest)
 
 
 def quality_tables(evaluations: list[Evaluation]) -> list[Table]:
     """Build one table per scene and one of means over scenes, of each of the KINDS."""
-    evaluations = [applicable(row) for row in with_deltas(evaluations)]
     tables = []
     for kind, columns in KINDS.items():
-        rows = [row for row in evaluations if any(column.key in row.results for column in columns)]
+        rows = [row for row in evaluations if any(column.value(row) is not None for column in columns)]
         for scene, of_scene in sorted(grouped(rows, lambda row: row.scene).items()):
             tables.append(scene_table(scene + kind, of_scene, columns))
-        means, scenes = over_scenes(rows)
+        averaged, scenes = over_scenes(rows)
         if len(scenes) > 1:
             note = f"Scenes: {', '.join(scenes)}."
-            tables.append(scene_table(f"Mean of {len(scenes)} scenes{kind}", means, columns, note))
+            tables.append(scene_table(f"Mean of {len(scenes)} scenes{kind}", averaged, columns, note))
     return tables
 
 
 def to_markdown(table: Table) -> str:
     """Format a table as Markdown, without its title."""
-    width, rows = len(table.header), []
+    rows = []
     for row in table.rows:
-        cells = [escaped(text) for text in row.cells] + [""] * (width - len(row.cells))
-        if row.section:
-            cells[0] = f"*{cells[0]}*"
-        rows.append([f"**{c}**" if i in row.best else c for i, c in enumerate(cells)])
+        if len(row.cells) == 1:
+            rows.append([f"*{row.cells[0]}*", *[""] * (len(table.header) - 1)])
+        else:
+            cells = [escaped(text) for text in row.cells]
+            rows.append([f"**{cell}**" if i in row.best else cell for i, cell in enumerate(cells)])
     return markdown.table([escaped(text) for text in table.header], rows)
 
 

@@ -3,20 +3,18 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.measure import markdown
-from bitymi_ns.measure.figure import Panel, png
+from bitymi_ns.measure.figure import panels, png, styled
 from bitymi_ns.measure.markdown import rendered
 from bitymi_ns.measure.stability.errors import PROBES, Backend, Errors, ExtendedErrors, against_extended, measure
-from bitymi_ns.measure.stability.scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Sweep, Way, extreme_scenes
+from bitymi_ns.measure.stability.scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Way, extreme_scenes
 
 ACCURATE = 1e-4  # largest error that counts as accurate
 STEPS = round(1 / (255 * ACCURATE))  # an 8-bit step in units of ACCURATE
@@ -175,19 +173,17 @@ LINES = (
 LOWEST = 1e-17
 
 
+@styled
 def _plot(swept: dict[str, list[SceneErrors]]) -> bytes:
-    panels = [Panel(partial(_panel, sweep, swept[sweep.name]), sweep.name, sweep.axis, "error") for sweep in SWEEPS]
-    figure = Figure().add_subplot()
-    return png(panels, [figure.plot([], style, color=color, label=label)[0] for label, color, style in LINES], most=4)
-
-
-def _panel(sweep: Sweep, rows: Sequence[SceneErrors], axes: Axes) -> None:
-    columns = zip(*((*row.errors, row.double.forward, row.double.gradient) for row in rows), strict=True)
-    for (_, color, style), values in zip(LINES, columns, strict=True):
-        axes.plot(sweep.values, [max(value, LOWEST) for value in values], style, color=color, ms=4, lw=1.3)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(numticks=5))
-    axes.set_yscale("log")
-    axes.set_ylim(LOWEST / 2, 30)
-    if sweep.values[-1] < sweep.values[0]:
-        axes.invert_xaxis()  # stiffer to the right
+    """Draw the errors of each sweep over its values, stiffer to the right."""
+    figure, axes = panels([sweep.name for sweep in SWEEPS], "", "error", most=4)
+    for panel, sweep in zip(axes, SWEEPS, strict=True):
+        rows = swept[sweep.name]
+        columns = zip(*((*row.errors, row.double.forward, row.double.gradient) for row in rows), strict=True)
+        for (label, color, style), values in zip(LINES, columns, strict=True):
+            panel.plot(sweep.values, np.maximum(values, LOWEST), style, color=color, ms=4, lw=1.3, label=label)
+        panel.set(xlabel=sweep.axis, xscale="log", yscale="log", ylim=(LOWEST / 2, 30))
+        panel.xaxis.set_major_locator(LogLocator(numticks=5))
+        if sweep.values[-1] < sweep.values[0]:
+            panel.invert_xaxis()
+    return png(figure, axes[0].get_lines())

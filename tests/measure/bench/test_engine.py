@@ -152,7 +152,7 @@ def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: list[Chain], tmp_
 def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: list[Chain], tmp_path: Path) -> None:
     (fakes.folder / "ns-eval").write_text("#!/bin/sh\nexit 0\n")
     (failure, *_) = run_chains(tmp_path / "work", matrix[:1])
-    assert "evaluation (trained)" in failure and "no figures" in failure
+    assert "evaluation (trained)" in failure and "cannot be read: it does not exist" in failure
 
 
 def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: list[Chain], tmp_path: Path) -> None:

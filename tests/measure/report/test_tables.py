@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from bitymi_ns.measure.report.records import evaluation_from
+from bitymi_ns.measure.report.records import Records, evaluation_from, link
 from bitymi_ns.measure.report.tables import COLUMNS, FITTED, Row, Table, quality_tables, to_markdown
 from tests.measure.report.pages import page_of
 from tests.view.browser import drive, plain_server
@@ -18,12 +18,13 @@ def test_layout_before_and_after_baking():
         make(psnr=27.40, flip=0.12, render_ms=50.0, surfels=12345, atlas_bytes=0),
         make(psnr=27.38, flip=0.12, render_ms=10.0, surfels=12345, bundle_bytes=2_500_000),
     ]
-    (table,) = quality_tables(rows)
-    assert table.header == ("Method", "PSNR ↑", "FLIP ↓", "Bundle MB ↓", "Points ↓", "ms ↓", "ΔPSNR")
+    link(records := Records(rows))
+    (table,) = quality_tables(records.evaluations)
+    assert table.header == ["Method", "PSNR ↑", "FLIP ↓", "Bundle MB ↓", "Points ↓", "ms ↓", "ΔPSNR"]
     before, trained, after, baked = table.rows
-    assert before.section and after.section
-    assert trained.cells == ("bitymi", "27.40", "0.120", "–", "12,345", "50.0", "–")
-    assert baked.cells == ("bitymi", "27.38", "0.120", "2.50", "12,345", "10.0", "−0.020")
+    assert [before.cells, after.cells] == [["Trained scene"], ["Baked bundle"]]
+    assert trained.cells == ["bitymi", "27.40", "0.120", "–", "12,345", "50.0", "–"]
+    assert baked.cells == ["bitymi", "27.38", "0.120", "2.50", "12,345", "10.0", "−0.020"]
     assert trained.best == {1} and baked.best == {5}  # equal columns have no best
 
 
@@ -34,7 +35,8 @@ def test_bytes_are_in_sight_in_a_window_of_1280_pixels(tmp_path):
     every |= dict(atlas_bytes=123_456_789, bundle_bytes=23_456_789)
     trained = {key: value for key, value in every.items() if "bytes" not in key}
     rows = [make(method="bitymi-quality", **trained), make(method="bitymi-quality", **every)]
-    main, fitted = quality_tables(rows)
+    link(records := Records(rows))
+    main, fitted = quality_tables(records.evaluations)
     assert main.header[-1] == "ΔPSNR" and main.header.index("Bundle MB ↓") < main.header.index("Points ↓")
     assert fitted.title == "fox, exposure aside"
     assert [title for title in main.header if "fitted" in title or "mean" in title] == []
@@ -50,7 +52,7 @@ def test_missing_values_are_dashes_and_never_best():
     (table,) = quality_tables(rows)
     assert table.rows[1].cells[2] == "–" and 2 not in table.rows[1].best
     (table,) = quality_tables([make(psnr=20.0, ssim=0.9)])  # empty columns are omitted
-    assert table.header == ("Method", "PSNR ↑", "SSIM ↑")
+    assert table.header == ["Method", "PSNR ↑", "SSIM ↑"]
 
 
 def test_means_only_over_what_covers_the_same_scenes():
@@ -58,11 +60,11 @@ def test_means_only_over_what_covers_the_same_scenes():
     *scenes, mean = quality_tables(rows)
     assert [t.title for t in scenes] == ["a", "b"]
     assert mean.title == "Mean of 2 scenes" and "a, b" in mean.note
-    assert [row.cells for row in mean.rows if not row.section] == [("bitymi", "21.00")]
+    assert [row.cells for row in mean.rows] == [["Trained scene"], ["bitymi", "21.00"]]
 
 
 def test_names_cannot_break_the_table():
-    table = Table("t", ("Method", "A"), (Row(("<script>a|b</script>", "1"), frozenset({1})),))
+    table = Table("t", ["Method", "A"], [Row(["<script>a|b</script>", "1"], {1})])
     title = table.rows[0].cells[0]
     page = page_of(title=title, notes=[title], quality=[table, table])
     assert "<script>" not in page and page.count("<th>&lt;script&gt;a|b&lt;/script&gt;</th>") == 2

@@ -129,7 +129,7 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
     train = partial(fit, scene, capture.train, [], config, SETTINGS["steps"], callback=calibration.every(10))
     _, training = calibration.timed(train)
-    trained, fragments, *_ = evaluate(scene, capture.views, config)
+    trained = evaluate(scene, capture.views, config)
     refine = RefineOptions(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
     to = (BakeOptions(format="bc7"), refine, calibration.every(10))
     baked, baking = calibration.timed(partial(bake, scene, cameras, capture.train, background, *to))
@@ -147,12 +147,12 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
         with suppress(lpips.LpipsUnavailable):  # reported by `main`
             distances.append(lpips.lpips(*pair, "alex"))
     return {
-        "psnr_trained": trained,
+        "psnr_trained": trained.psnr,
         "psnr_baked": statistics.fmean(quality),
         "lpips_baked": statistics.fmean(distances or [math.nan]),
         "bundle_bytes": size,
         "surfels": len(scene),
-        "fragments_per_pixel": fragments / (cameras[0].width * cameras[0].height),
+        "fragments_per_pixel": trained.fragments / (cameras[0].width * cameras[0].height),
         "train": training,
         "bake": baking,
         "frame": statistics.median(units),

@@ -230,7 +230,7 @@ def train_scene(
     config = replace(copy.deepcopy(preset.train), seed=seed, refine_poses=refine_poses)
     scene = scene_for_views(views, points, colors, preset.scene, config, steps)
     scene, views = scene.to(device), [view.to(device) for view in views]
-    step_done = None if callback is None else lambda trainer, *_: callback(trainer.step, trainer.loss)
+    step_done = None if callback is None else lambda trainer: callback(trainer.step, trainer.loss)
     return scene, fit(scene, views, [view.to(device) for view in eval_views], config, steps, step_done)
 
 

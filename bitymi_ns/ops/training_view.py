@@ -5,21 +5,66 @@ The results are those of `project`, `view_color`, `rasterize_image`, `train.view
 """
 
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from .backend import dense, kernel, kernel_class, module, on_device, stream_of, workspace
+from .backend import dense, kernel, kernel_class, module, on_device, on_same_device, stream_of, workspace
 from .bin_cuda import check_pair_count
 from .blend import checked_texels
 from .constants import FRAME, GEOM
 from .parameters import GEOMETRY, Tensors
-from .picture_cuda import PhotographTarget
 from .project import CameraLike, Projection, checked_geometry, geometry_of, rigid_gradient
 from .texel import TexelAlpha, TexelDescent, TexelTiles, gradient_or_step
 from .view_color import check_view_color, lettered
 from .view_kinds import entry_of
+
+
+@dataclass(frozen=True)
+class PhotographTarget:
+    """A photograph to compare a picture with, and the weights of the losses.
+
+    Attributes:
+        target: [H, W, 3].
+        mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
+        background: [3] colour behind the picture; None: black, or the picture contains it.
+        ssim_weight: w of (1 - w) L1 + w (1 - SSIM).
+        falloff_weight: weight of the mean of omega beta, omega = exp(-falloff_gamma e).
+        falloff_gamma: decay of omega with the error e, the sum of absolute differences over rgb.
+    """
+
+    target: Tensor
+    mask: Tensor | None
+    background: Tensor | None
+    ssim_weight: float
+    falloff_weight: float
+    falloff_gamma: float
+
+    def check(self, like: Tensor, size: tuple[int, ...]) -> None:
+        """Raise a ValueError unless shapes fit a picture [H, W] = `size`, the mask is bool and devices are `like`'s."""
+        if tuple(self.target.shape) != (*size, 3):
+            raise ValueError(f"the picture is {list(size)} and the photograph {list(self.target.shape)}")
+        on_same_device(like, target=self.target)
+        if self.mask is not None:
+            on_same_device(like, mask=self.mask)
+            if self.mask.dtype != torch.bool or self.mask.numel() != size[0] * size[1]:
+                mask = f"{list(self.mask.shape)} {self.mask.dtype}"
+                raise ValueError(f"the picture is {list(size)}, its mask {mask}, not bool")
+
+    def arguments(self, like: Tensor, correction: Tensor | None = None) -> dict[str, Any]:
+        """Build the kernels' arguments for a picture (`Picture` of csrc/cuda/training.h). `like`: of the picture's
+        dtype and device. `correction`: of the photograph, [3] or [3, 4], see `train.views.View`; None: none."""
+        return {
+            "target": dense(self.target, like),
+            "mask": None if self.mask is None else self.mask.reshape(-1).contiguous().view(torch.uint8),
+            "background": None if self.background is None else dense(self.background, like),
+            "correction": None if correction is None else dense(correction, like),
+            "corrected": 0 if correction is None else correction.numel(),
+            "ssim_weight": self.ssim_weight,
+            "falloff_weight": self.falloff_weight,
+            "falloff_gamma": self.falloff_gamma,
+        }
 
 
 @dataclass(frozen=True)
@@ -29,15 +74,11 @@ class ComparedView:
     Attributes:
         photometric, falloff: the weighted losses, scalars.
         projection: projected surfels.
-        depth, normal, soft_overdraw: as in `scene.RenderOutput`: there are none.
     """
 
     photometric: Tensor
     falloff: Tensor
     projection: Projection
-    depth: ClassVar[None] = None
-    normal: ClassVar[None] = None
-    soft_overdraw: ClassVar[None] = None
 
 
 @dataclass
@@ -176,7 +217,7 @@ def training_view(
 
     Raises:
         RuntimeError: 2^31 pairs of surfel and tile or more, or not a CUDA device.
-        ValueError: as `project`, `view_color`, `picture_losses` and `blended_image`.
+        ValueError: as `project`, `view_color`, `PhotographTarget.check` and `blended_image`.
     """
     geometry = checked_geometry(geometry_of(surfels), camera)
     means = geometry[0]

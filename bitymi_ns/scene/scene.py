@@ -27,11 +27,9 @@ from bitymi_ns.ops import (
     view_color,
 )
 from bitymi_ns.ops.capacity import memory_errors
-from bitymi_ns.ops.constants import IMAGE_CHANNELS
 from bitymi_ns.ops.parameters import GEOMETRY, Tensors
-from bitymi_ns.ops.picture_cuda import PhotographTarget
 from bitymi_ns.ops.project import geometry_of
-from bitymi_ns.ops.training_view import ComparedView, training_view
+from bitymi_ns.ops.training_view import ComparedView, PhotographTarget, training_view
 
 from .camera import Camera
 from .config import SceneConfig
@@ -53,7 +51,6 @@ class RenderOutput:
         soft_overdraw: [H, W, 1] differentiable count of fragments per pixel; None without `overdraw_half`.
         fragments: blended fragments; `Bands` if they were too many for one list, `Marks` if rendered without a list.
         projection: projected surfels.
-        image: [H, W, 5] rgb, alpha and beta in one tensor; None with maps or soft overdraw.
     """
 
     rgb: Tensor
@@ -64,7 +61,6 @@ class RenderOutput:
     soft_overdraw: Tensor | None
     fragments: Fragments | Bands | Marks
     projection: Projection
-    image: Tensor | None = None
 
     @classmethod
     def of_image(
@@ -97,7 +93,6 @@ class RenderOutput:
             soft_overdraw=image[..., -1:] if soft_overdraw else None,
             fragments=fragments,
             projection=projection,
-            image=image if image.shape[-1] == IMAGE_CHANNELS else None,
         )
 
     @property

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
 
-class Quality(NamedTuple):
+@dataclass
+class Quality:
     """Means over views; NaN without views."""
 
     psnr: float  # dB, over the views with unmasked pixels, with interpolated exposures (`Exposure.at`)
@@ -50,12 +52,12 @@ def evaluate(
     values, fitted, along, refined, uncorrected, fragments = [], [], [], [], [], []
     corrections = None if exposure is None or exposure.table is None else exposure
     for view in (view.to(device) for view in views):
-        output = scene.render(view.camera, background=background, field_mode="frozen")
-        target = view.target(background, device)
+        if corrections is not None:
+            view = view._replace(correction=corrections.at(view.file))
+        output, rgb, target = view.drawn(scene, background)
         if corrections is not None:
             uncorrected.append(psnr(output.rgb.clamp(0.0, 1.0), target, view.mask))
-            view = view._replace(correction=corrections.at(view.file))
-        rgb = view.shown(output.rgb, output.alpha, background).clamp(0.0, 1.0)
+        rgb = rgb.clamp(0.0, 1.0)
         values.append(psnr(rgb, target, view.mask))
         fitted.append(fitted_psnr(rgb, target, view.mask))
         fragments.append(len(output.fragments))

@@ -59,8 +59,8 @@ class Exposure:
         rows = {file: row for row, file in enumerate(dict.fromkeys(files or ()))}
         self._photographs = None if files is None else [rows[file] for file in files]
         self._neighbours = Neighbours(list(rows))
-        # Adam's moments [V, ...] and number of steps; photographs that a step does not use keep their moments
-        self._moments: tuple[Tensor, Tensor] | None = None
+        # Adam's moments [2, V, ...] and number of steps; photographs that a step does not use keep their moments
+        self._moments: Tensor | None = None
         self._steps = 0
         self._learning: list[tuple[int, Tensor]] = []
 
@@ -85,7 +85,11 @@ class Exposure:
         log_gains = self._pooled(agreement.log_gains, points_seen)
         seen = self._summed(points_seen[:, None])
         gains = (seen * log_gains + PRIOR_POINTS * prior) / (seen + PRIOR_POINTS)
-        self._begin(gains.to(points.device), affine=self.kind == "affine")
+        gains = gains.to(points.device)
+        table = gains.new_zeros(len(gains), 12 if self.kind == "affine" else 3)
+        table[:, _diagonal(table)] = gains
+        self.table = settled(table)
+        self._moments, self._steps = table.new_zeros(2, *table.shape), 0
 
     def _summed(self, values: Tensor) -> Tensor:
         """Sum values [V, C] of the views of each photograph."""
@@ -104,12 +108,6 @@ class Exposure:
     def count(self, views: int) -> int:
         """Count the photographs of `views` views."""
         return views if self._photographs is None else max(self._photographs, default=-1) + 1
-
-    def _begin(self, log_gains: Tensor, affine: bool) -> None:
-        first = log_gains.new_zeros(len(log_gains), 12 if affine else 3)
-        first[:, _diagonal(first)] = log_gains
-        self.table = settled(first)
-        self._moments, self._steps = (torch.zeros_like(self.table), torch.zeros_like(self.table)), 0
 
     @property
     def sentence(self) -> str:
@@ -148,11 +146,11 @@ class Exposure:
     def at(self, file: Path | None) -> Tensor | None:
         """Return the correction of a photograph of the capture, as `of` does: its own, or interpolated between training
         photographs (`Neighbours`) as log gains and other entries. None: mean exposure."""
-        found = None if file is None else self._neighbours.of(file)
-        if self.table is None or found is None:
+        neighbours = None if file is None else self._neighbours.of(file)
+        if self.table is None or neighbours is None:
             return None
-        before, after, share = found
-        return _correction(torch.lerp(self.table[before], self.table[after], share))
+        before, after, weight = neighbours
+        return _correction(torch.lerp(self.table[before], self.table[after], weight))
 
     @torch.no_grad()
     def step(self, rate: float, processes: Processes = ALONE) -> None:
@@ -199,47 +197,43 @@ class Exposure:
         return [(row, sums[row, :-1] / processes.views) for row in seen]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a resumed run: tensors, numbers and strings only."""
+        """Return the state for a resumed run, Adam's in the form of torch's optimisers: tensors, numbers and strings
+        only."""
+        adam = None
+        if self._moments is not None:
+            mean, square = (moment.clone() for moment in self._moments)
+            moments = {0: {"step": self._steps, "exp_avg": mean, "exp_avg_sq": square}} if self._steps else {}
+            adam = {"state": moments, "param_groups": [{"lr": 0.0, "betas": BETAS, "eps": EPS, "params": [0]}]}
         return {
             "kind": self.kind,
             "decided": self.decided,
             "finding": self.reason,
             "table": None if self.table is None else self.table.clone(),
-            "optimizer": self._optimizer_state(),
+            "optimizer": adam,
         }
 
-    def _optimizer_state(self) -> dict[str, Any] | None:
-        """Return Adam's state in the form of torch's optimisers."""
-        if self._moments is None:
-            return None
-        mean, square = (moment.clone() for moment in self._moments)
-        state = {0: {"step": self._steps, "exp_avg": mean, "exp_avg_sq": square}} if self._steps else {}
-        return {"state": state, "param_groups": [{"lr": 0.0, "betas": BETAS, "eps": EPS, "params": [0]}]}
-
     def load_state_dict(
-        self, state: Mapping[str, Any] | None, count: int, device: torch.device | str | None = None
+        self, state: Mapping[str, Any] | None, views: int | None = None, device: torch.device | str | None = None
     ) -> None:
         """Restore what `state_dict` returned. Ignores state saved with another option or number of photographs.
-        `state`: None: saved before corrections existed. Then, and after `off`, `auto` makes none. `count`: number of
-        training views. `device`: device for the corrections; None: that of `state`."""
+        `state`: None: saved before corrections existed. Then, and after `off`, `auto` makes none. `views`: number of
+        training views; None: as then. `device`: device for the corrections; None: that of `state`."""
         if state is None or (self.kind == "auto" and state["kind"] == "off"):  # corrections do not begin midway
             self.decided = self.kind in ("off", "auto")
             return
         table = state["table"]
-        if state["kind"] != self.kind or (table is not None and len(table) != self.count(count)):
+        if state["kind"] != self.kind or (table is not None and views is not None and len(table) != self.count(views)):
             return
         self.decided, self.reason = bool(state["decided"]), str(state["finding"])
         if table is None:
             self.table = self._moments = None
             return
-        self._begin(table[:, _diagonal(table)].to(device or table.device), table.shape[1] > 3)
-        assert self.table is not None and self._moments is not None
-        self.table.copy_(table)
-        saved = state["optimizer"]["state"].get(0)
-        if saved is not None:
+        self.table = table = table.to(device or table.device, copy=True)
+        moments, self._steps = table.new_zeros(2, *table.shape), 0
+        if saved := state["optimizer"]["state"].get(0):
+            moments.copy_(torch.stack([saved[name].to_dense() for name in ("exp_avg", "exp_avg_sq")]))
             self._steps = int(saved["step"])
-            for moment, name in zip(self._moments, ("exp_avg", "exp_avg_sq"), strict=True):
-                moment.copy_(saved[name].to_dense())
+        self._moments = moments
 
 
 def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] | None = None) -> Exposure:
@@ -265,8 +259,8 @@ def corrected(
             "the capture, or leave the texels as they are baked (--finetune-steps 0)"
         )
     with torch.no_grad():
-        found = [exposure.of(i) for i in range(len(views))]
-    return OnDemand(len(views), lambda i: views[i]._replace(correction=found[i]))
+        corrections = [exposure.of(i) for i in range(len(views))]
+    return OnDemand(len(views), lambda i: views[i]._replace(correction=corrections[i]))
 
 
 def settled(table: Tensor) -> Tensor:

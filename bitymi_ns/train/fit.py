@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.evaluate import evaluate
+from bitymi_ns.train.evaluate import Quality, evaluate
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.optimizers import forget_gradients, make_optimizers, step
 from bitymi_ns.train.processes import ALONE, Processes
@@ -24,25 +24,16 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
 
-@dataclass
-class LogEntry:
-    """The state of a run after `step` steps."""
+@dataclass(kw_only=True)
+class LogEntry(Quality):
+    """The state of a run after `step` steps, with the quality of the evaluation views; poses are aligned after the last
+    step alone."""
 
     step: int
     seconds: float  # Wall-clock time of training, without evaluation.
     cpu_seconds: float  # Processor time of training over all threads, without evaluation.
     surfels: int
-    fragments: float  # Blended fragments per view, mean over the evaluation views.
     loss: float  # Objective of the last training step.
-    psnr: float  # dB, mean over the evaluation views at full size; NaN without evaluation views.
-    fitted_psnr: float  # PSNR in dB after an affine fit of each view's colours (`losses.color_fitted`).
-    carried_psnr: float = math.nan
-    """PSNR in dB with poses moved along with the training poses (`poses.carried`); NaN before the last step and in
-    runs without pose refinement."""
-    refined_psnr: float = math.nan  # PSNR in dB with poses aligned to the finished scene; NaN likewise.
-    mean_exposure_psnr: float = math.nan
-    """PSNR in dB without the exposures that `psnr` interpolates between the training photographs'; NaN if these are not
-    corrected."""
 
 
 @dataclass
@@ -119,32 +110,31 @@ def fit(
     eval_views: Sequence[View],
     config: TrainConfig,
     max_steps: int,
-    callback: Callable[[Trainer, dict[str, Tensor], RenderOutput | ComparedView, dict[str, float]], None] | None = None,
+    callback: Callable[[Trainer], None] | None = None,
     eval_steps: Sequence[int] = (),
 ) -> TrainLog:
     """Train a scene in place.
 
     Args:
         views: training views at full size.
-        callback: called after each step with the trainer, the loss terms, the render and the strategy's report.
+        callback: called after each step.
         eval_steps: numbers of steps after which an entry is logged; the last step always gets one.
     """
     trainer = Trainer(scene, views, config, max_steps)
     clock, log = trainer.training.clock, TrainLog()
     due = {*eval_steps, max_steps}
     while trainer.step < max_steps:
-        terms, output, report = trainer.advance()
+        *_, report = trainer.advance()
         if report:
             log.events.append({"step": trainer.step - 1, **report})
         if trainer.step in due:
             trainer.training.watch.finish(scene)
             poses = trainer.training.poses if trainer.step == max_steps else None
             poses = poses if poses and poses.refined else None
-            found = evaluate(scene, eval_views, config, poses, trainer.training.exposure)
-            times, loss = (clock.seconds, clock.cpu_seconds), trainer.loss
-            figures = (found.psnr, found.fitted_psnr, found.carried_psnr, found.refined_psnr, found.mean_exposure_psnr)
-            log.entries.append(LogEntry(trainer.step, *times, len(scene), found.fragments, loss, *figures))
+            quality = evaluate(scene, eval_views, config, poses, trainer.training.exposure)
+            costs = {"seconds": clock.seconds, "cpu_seconds": clock.cpu_seconds, "surfels": len(scene)}
+            log.entries.append(LogEntry(step=trainer.step, loss=trainer.loss, **costs, **vars(quality)))
         if callback is not None:
-            callback(trainer, terms, output, report)
+            callback(trainer)
     log.cameras = [trainer.training.poses.of(i, view.camera) for i, view in enumerate(views)]
     return log

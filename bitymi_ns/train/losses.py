@@ -1,4 +1,7 @@
-"""Training objective: photometric, falloff, overdraw, depth and normal losses."""
+"""Training objective: photometric, falloff, overdraw, depth and normal losses.
+
+A `mask` is [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +14,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.picture_cuda import PhotographTarget, picture_losses
-from bitymi_ns.ops.training_view import ComparedView
+from bitymi_ns.ops.training_view import ComparedView, PhotographTarget
 from bitymi_ns.train.config import LossConfig
 
 if TYPE_CHECKING:
@@ -22,7 +24,7 @@ DEPTH_EDGE = 0.1
 """Relative depth difference between neighbouring pixels that counts as an edge. Photographs blend both sides of it,
 depth maps do not, and depth sensors are least reliable there."""
 SAME_COLOR = 0.01  # ridge of colour fits: keeps the contrast of colours with a smaller standard deviation
-FITTED = 0.01  # minimum share of a half's pixels for a colour fit
+FITTED = 0.01  # minimum fraction of a half's pixels for a colour fit
 SSIM_WINDOW = 11  # side of the SSIM window in pixels; narrower images have no valid window
 
 
@@ -39,14 +41,19 @@ def objective(
     Args:
         output: rendered view of H x W pixels; with `soft_overdraw` if the overdraw loss is on.
         target: [H, W, 3] photograph at the same size, over the same background.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
         depth, normal: maps as in `View`; used if the view was rendered with maps.
 
     Returns:
         `photometric`; `falloff` unless its weight is 0; `overdraw` if the view was rendered with `soft_overdraw`;
         `depth` and `normal` if used and their weights are not 0.
     """
-    terms = _picture_terms(output, target, config, mask)
+    if isinstance(output, ComparedView):
+        terms = {"photometric": output.photometric, "falloff": output.falloff}
+        return terms if config.falloff_weight > 0.0 else {"photometric": output.photometric}
+    terms = {"photometric": photometric(output.rgb, target, config.ssim_weight, mask)}
+    if config.falloff_weight > 0.0:
+        omega = error_weight(output.rgb, target, config.falloff_gamma, mask)
+        terms["falloff"] = config.falloff_weight * mean_where_right(omega, output.beta, mask)
     if output.soft_overdraw is not None:
         omega = error_weight(output.rgb, target, config.falloff_gamma, mask)
         terms["overdraw"] = config.overdraw_weight * mean_where_right(omega, output.soft_overdraw, mask)
@@ -59,33 +66,15 @@ def objective(
     return terms
 
 
-def _picture_terms(
-    output: RenderOutput | ComparedView, target: Tensor, config: LossConfig, mask: Tensor | None
-) -> dict[str, Tensor]:
-    """Compute the terms that every view has, for which there are CUDA kernels: `photometric` and `falloff`."""
-    with_falloff = config.falloff_weight > 0.0
-    if isinstance(output, ComparedView):
-        both = output.photometric, output.falloff
-    elif output.image is not None and fused_losses(config, output.image):
-        both = picture_losses(output.image, photograph_target(target, config, mask))
-    else:
-        first = photometric(output.rgb, target, config.ssim_weight, mask)
-        if not with_falloff:
-            return {"photometric": first}
-        omega = error_weight(output.rgb, target, config.falloff_gamma, mask)
-        both = first, config.falloff_weight * mean_where_right(omega, output.beta, mask)
-    return {"photometric": both[0], "falloff": both[1]} if with_falloff else {"photometric": both[0]}
-
-
 def photograph_target(
     target: Tensor, config: LossConfig, mask: Tensor | None, background: Tensor | None = None
 ) -> PhotographTarget:
-    """Make the argument of the CUDA kernels for the losses of `_picture_terms`."""
+    """Make the argument of `Scene.compare`."""
     return PhotographTarget(target, mask, background, config.ssim_weight, config.falloff_weight, config.falloff_gamma)
 
 
 def fused_losses(config: LossConfig, image: Tensor) -> bool:
-    """Return True if fused CUDA kernels compute the losses of an image [H, W, C]."""
+    """Return True if CUDA kernels can compute the losses of an image [H, W, C] (`Scene.compare`)."""
     return config.ssim_weight > 0.0 and min(image.shape[:2]) >= SSIM_WINDOW and cuda_backend(image.device)
 
 
@@ -103,8 +92,7 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
         rgb: [H, W, 3] rendered image.
         target: [H, W, 3] photograph in [0, 1].
         ssim_weight: w; 0 for images too small for an 11 x 11 window.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts. Other pixels are excluded from L1 and made equal in
-            both images for SSIM, so that they have no gradient.
+        mask: other pixels are excluded from L1 and made equal in both images for SSIM: they have no gradient.
 
     Returns:
         Scalar; 0 if no pixel counts.
@@ -123,18 +111,10 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
 
 
 def error_weight(rgb: Tensor, target: Tensor, gamma: float, mask: Tensor | None = None) -> Tensor:
-    """Compute omega = exp(-gamma e) of the falloff loss, with e = L1 summed over rgb: near 1 where the image is right,
-    near 0 where it is wrong.
+    """Compute omega = exp(-gamma e) of the falloff loss, [H, W, 1], with e = L1 summed over rgb [H, W, 3]: near 1 where
+    the image is right, near 0 where it is wrong, 0 where the mask is False.
 
     Without gradient: else a larger error would lower the loss.
-
-    Args:
-        rgb, target: [H, W, 3].
-        gamma: decay with the error.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; omega is 0 elsewhere.
-
-    Returns:
-        [H, W, 1].
     """
     omega = torch.exp(-gamma * (rgb.detach() - target.detach()).abs().sum(-1, keepdim=True))
     # where() also keeps a NaN in an excluded pixel of the photograph out
@@ -148,7 +128,6 @@ def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) 
         omega: [H, W, 1] from `error_weight`, with the same mask.
         values: [H, W, 1]. Falloff: `RenderOutput.beta`, sum_i w_i beta_i, which carries gradient to the blending
             weights and to beta. Overdraw: `RenderOutput.soft_overdraw`, see `ops.soft_overdraw`.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts.
 
     Returns:
         Scalar; 0 if no pixel counts.
@@ -163,7 +142,6 @@ def depth_error(rendered: Tensor, alpha: Tensor, depth: Tensor, mask: Tensor | N
         rendered: [H, W, 1] sum of w z, camera z.
         alpha: [H, W, 1] sum of w.
         depth: [H, W] or [H, W, 1] d; any float dtype. Unknown where not finite or not above 0.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
 
     Returns:
         Scalar; 0 if no depth is known.
@@ -191,7 +169,6 @@ def normal_error(rendered: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor |
         rendered: [H, W, 3] sum of w n, camera frame.
         alpha: [H, W, 1] sum of w.
         normal: [H, W, 3] n in the same frame; any float dtype. Unknown where not finite or 0.
-        mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
 
     Returns:
         Scalar; 0 if no normal is known.
@@ -212,7 +189,7 @@ def _mean_of(values: Tensor, known: Tensor, mask: Tensor | None) -> Tensor:
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
     """Compute the PSNR in dB, at most 100 (equal images); NaN if no pixel counts. `image` and `target`: [H, W, 3] in
-    [0, 1]. `mask`: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere."""
+    [0, 1]."""
     error = (image - target).square()
     if mask is not None:
         error = error[mask.reshape(error.shape[:2])]
@@ -226,8 +203,8 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
 
     Compensates exposure and white balance of held-out photographs: matrix [3, 3] and offset [3] are the least squares
     fit to `target` over the unmasked pixels of the other half. A half is not mapped if the other half is not finite, or
-    if the share of the other half's pixels that count is below `FITTED`. `image` and `target`: [H, W, 3] in [0, 1].
-    `mask`: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere."""
+    if the fraction of the other half's pixels that count is below `FITTED`. `image` and `target`: [H, W, 3] in
+    [0, 1]."""
     colors = torch.cat([image, torch.ones_like(image[..., :1])], -1).double()  # [H, W, 4]
     both = torch.cat([colors, target - image], -1)  # [H, W, 7] double
     if mask is not None:
@@ -237,14 +214,14 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
     sums = [[(both[:, by, i : i + 1] * both[:, by]).sum((0, 1)) for i in range(4)] for by in (right, left)]
     sums = torch.stack([torch.stack(rows) for rows in sums]).cpu()  # [2, 4, 7]
     fitted = []
-    for of, by in zip((left, right), sums, strict=True):
+    for half, by in zip((left, right), sums, strict=True):
         pixels = by[3, 3]
         if not bool(by.isfinite().all()) or pixels < max(1.0, 0.5 * FITTED * image.shape[0] * image.shape[1]):
-            fitted.append(image[:, of])
+            fitted.append(image[:, half])
             continue
         ridge = SAME_COLOR**2 * pixels * torch.eye(4, dtype=by.dtype)
         affine = torch.linalg.solve(by[:, :4] + ridge, by[:, 4:]).to(colors)  # [4, 3]
-        fitted.append(image[:, of] + sum(colors[:, of, i : i + 1] * affine[i] for i in range(4)))
+        fitted.append(image[:, half] + sum(colors[:, half, i : i + 1] * affine[i] for i in range(4)))
     return torch.cat(fitted, 1).clamp(0.0, 1.0).to(image)
 
 

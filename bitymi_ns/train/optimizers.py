@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,6 @@ from bitymi_ns.scene.field import HashField
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
-
 
 EPS = 1e-15  # Adam's epsilon
 BETAS = (0.9, 0.999)  # Adam's betas of surfel parameters
@@ -40,14 +39,9 @@ def _fuses(device: str) -> bool:
     return True
 
 
-def surfel_optimizers(scene: Scene) -> dict[str, Adam]:
-    """Create one optimiser per surfel parameter, by its name."""
-    return {name: adam([p]) for name, p in scene.surfels.items()}
-
-
 def make_optimizers(scene: Scene) -> dict[str, Adam]:
     """Create the optimisers of the surfel parameters, and `field_table` and `field_mlp` for a hash field."""
-    optimizers = surfel_optimizers(scene)
+    optimizers = {name: adam([p]) for name, p in scene.surfels.items()}
     if isinstance(scene.field, HashField):
         table, *mlp = scene.field.weights
         optimizers["field_table"] = adam([table], FIELD_BETAS)
@@ -56,122 +50,64 @@ def make_optimizers(scene: Scene) -> dict[str, Adam]:
 
 
 PLAIN = {"fused": True, "weight_decay": 0.0, "amsgrad": False, "maximize": False, "differentiable": False}
-"""Options of the Adam groups that `step` fuses."""
-
-
-class _AdamParameter(NamedTuple):
-    """A parameter of a fused Adam optimiser, with its state and options."""
-
-    parameter: Tensor
-    gradient: Tensor
-    mean: Tensor
-    square: Tensor
-    step: Tensor
-    rate: float
-    betas: tuple[float, float]
-    eps: float
-    factors: Tensor | None  # [N], of the updates of the parameter's rows
+"""Options of the Adam groups that the kernel steps."""
 
 
 @torch.no_grad()
 def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> None:
-    """Step all optimisers, as calling each one's `step` would, and scale the updates row by each.
+    """Step all optimisers, as calling each one's `step` would, and scale the updates row by row.
 
-    Each Adam.step costs 100-200 us of Python, ten times the GPU work. Fused Adam optimisers are therefore stepped
-    together: on the CPU by one call per learning rate, bit-identical to each `step`, on CUDA devices by one kernel.
-    `optimizers`: by parameter group. `factors`: row factors [N] of the updates of parameters [N, ...], by parameter
-    group."""
-    fused: list[_AdamParameter] = []
+    Each Adam.step costs 100-200 us of Python, ten times the GPU work, so on a CUDA device one kernel steps all fused
+    Adam optimisers. `optimizers`: by parameter group. `factors`: row factors [N] of the updates of parameters [N, ...],
+    by parameter group."""
+    fused: list[dict[str, Any]] = []
     for name, optimizer in optimizers.items():
-        found = _fusable(optimizer, factors.get(name))
-        if found is None:
-            before = [p.detach().clone() for p in optimizer.param_groups[0]["params"] if name in factors]
-            optimizer.step()
-            for parameter, values in zip(optimizer.param_groups[0]["params"], before, strict=False):
-                _scale_update(parameter, values, factors[name])
-        else:
-            fused += found
-    if fused and cuda_backend(fused[0].parameter.device):
-        _step_by_kernel(fused)
-    elif fused:
-        _step_by_torch(fused)
+        arguments = _kernel_arguments(optimizer, factors.get(name))
+        if arguments is not None:
+            fused += arguments
+            continue
+        parameters = optimizer.param_groups[0]["params"]
+        before = [parameter.detach().clone() for parameter in parameters if name in factors]
+        optimizer.step()
+        for parameter, old in zip(parameters, before, strict=False):
+            torch.lerp(old, parameter, factors[name].view(-1, *[1] * (parameter.ndim - 1)), out=parameter)
+    if fused:
+        like = fused[0]["parameter"]
+        with on_device(like.device):
+            kernel_class("adam", like)(fused, stream=stream_of(like.device))
 
 
-def _scale_update(parameter: Tensor, before: Tensor, factors: Tensor) -> None:
-    torch.lerp(before, parameter, factors.view(-1, *[1] * (parameter.ndim - 1)), out=parameter)
-
-
-def _step_by_kernel(fused: Sequence[_AdamParameter]) -> None:
-    device = fused[0].parameter.device
-    arguments = [
-        {
-            "parameter": each.parameter,
-            "gradient": dense(each.gradient, each.parameter),
-            "mean": each.mean,
-            "square": each.square,
-            "step": each.step,
-            "width": each.parameter[0].numel() if each.factors is not None and len(each.parameter) else 1,
-            "factors": each.factors,
-            "rate": each.rate,
-            "beta1": each.betas[0],
-            "beta2": each.betas[1],
-            "eps": each.eps,
-        }
-        for each in fused
-    ]
-    with on_device(device):
-        kernel_class("adam", fused[0].parameter)(arguments, stream=stream_of(device))
-
-
-def _step_by_torch(fused: Sequence[_AdamParameter]) -> None:
-    scaled = [
-        (each.parameter, each.parameter.detach().clone(), each.factors) for each in fused if each.factors is not None
-    ]
-    batches: dict[tuple[Any, ...], list[_AdamParameter]] = {}
-    for each in fused:
-        batches.setdefault((each.parameter.dtype, each.rate, *each.betas, each.eps), []).append(each)
-    torch._foreach_add_([each.step for each in fused], 1.0)
-    for (_, rate, first, second, eps), batch in batches.items():
-        torch._fused_adam_(
-            [each.parameter for each in batch],
-            [each.gradient for each in batch],
-            [each.mean for each in batch],
-            [each.square for each in batch],
-            [],
-            [each.step for each in batch],
-            lr=rate,
-            beta1=first,
-            beta2=second,
-            weight_decay=0.0,
-            eps=eps,
-            amsgrad=False,
-            maximize=False,
-        )
-    for parameter, before, row_factors in scaled:
-        _scale_update(parameter, before, row_factors)
-
-
-def _fusable(optimizer: Optimizer, factors: Tensor | None) -> list[_AdamParameter] | None:
-    """List the parameters with a gradient; None if the optimiser must step itself, because it is no plain fused Adam or
-    has no state yet."""
-    if type(optimizer) is not Adam:
+def _kernel_arguments(optimizer: Optimizer, factors: Tensor | None) -> list[dict[str, Any]] | None:
+    """Build the kernel's arguments for the parameters with a gradient; None if the optimiser must step itself, because
+    it is on the CPU, no plain fused Adam, or has no state yet."""
+    if type(optimizer) is not Adam or not cuda_backend(optimizer.param_groups[0]["params"][0].device):
         return None
-    found = []
+    arguments = []
     for group in optimizer.param_groups:
         if any(group.get(name) != value for name, value in PLAIN.items()) or not isinstance(group["lr"], float):
             return None
         for parameter in group["params"]:
-            gradient = parameter.grad
+            gradient, state = parameter.grad, optimizer.state.get(parameter)
             if gradient is None:
                 continue
-            state = optimizer.state.get(parameter)
             if not state or gradient.is_sparse or state["step"].device != parameter.device:
                 return None
-            moments = (state["exp_avg"], state["exp_avg_sq"], state["step"])
-            found.append(
-                _AdamParameter(parameter, gradient, *moments, group["lr"], group["betas"], group["eps"], factors)
+            arguments.append(
+                {
+                    "parameter": parameter,
+                    "gradient": dense(gradient, parameter),
+                    "mean": state["exp_avg"],
+                    "square": state["exp_avg_sq"],
+                    "step": state["step"],
+                    "width": parameter[0].numel() if factors is not None and len(parameter) else 1,
+                    "factors": factors,
+                    "rate": group["lr"],
+                    "beta1": group["betas"][0],
+                    "beta2": group["betas"][1],
+                    "eps": group["eps"],
+                }
             )
-    return found
+    return arguments
 
 
 def set_rate(optimizer: Optimizer, rate: float) -> None:

@@ -219,9 +219,8 @@ def gauge(centers: Tensor, extent: float) -> Tensor:
 @torch.no_grad()
 def view_psnr(scene: Scene, view: View, background: Tensor | None) -> float:
     """Compute the PSNR, in dB, of a scene over a background against a photograph on the scene's device."""
-    output = scene.render(view.camera, background, "frozen")
-    rgb = view.shown(output.rgb, output.alpha, background).clamp(0.0, 1.0)
-    return psnr(rgb, view.target(background, rgb.device), view.mask)
+    _, rgb, target = view.drawn(scene, background)
+    return psnr(rgb.clamp(0.0, 1.0), target, view.mask)
 
 
 @torch.enable_grad()
@@ -229,12 +228,11 @@ def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: fl
     """Align a camera to a fixed scene: minimise the photometric loss against its photograph from the given pose.
     `view`: on the scene's device, at full size. `background`: [3] colour behind the scene; None: black. `ssim_weight`:
     SSIM weight of the photometric loss."""
-    target = view.target(background, scene.surfels["means"].device)
 
     def judge(viewmat: Tensor) -> tuple[float, Tensor, Projection]:
         motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
-        output = scene.render(view.camera.posed(moved(viewmat, motion)), background, "frozen")
-        rgb = view.shown(output.rgb, output.alpha, background)
+        posed = view._replace(camera=view.camera.posed(moved(viewmat, motion)))
+        output, rgb, target = posed.drawn(scene, background)
         loss = photometric(rgb, target, ssim_weight, view.mask)
         (gradient,) = torch.autograd.grad(loss, motion)
         return float(loss.detach()), gradient, output.projection

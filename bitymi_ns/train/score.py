@@ -80,9 +80,7 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     background = eval_background(config, device)
     for number in range(processes.rank, len(views), processes.count):
         view = views[number].to(device)
-        target = view.target(background, device)
-        output = scene.render(view.camera, background=background, field_mode="frozen")
-        rgb = view.shown(output.rgb, output.alpha, background)
+        output, rgb, target = view.drawn(scene, background)
         bad = bad_pixels(rgb, target, config.densify.error_threshold, view.mask)
         counts = output.fragments.masked_counts(bad.flatten(), n)  # [N]
         loss = photometric(rgb, target, config.loss.ssim_weight, view.mask)
@@ -119,13 +117,11 @@ def removal_errors(
     for number in range(processes.rank, len(views), processes.count):
         view = views[number].to(device)
         background = step_background(config, view, seed + number, device)
-        target = view.target(background, device)
-        signs = _random_signs(target, seed + number)
-        if view.mask is not None:
-            signs = signs * view.mask.reshape(*target.shape[:2], 1)
         with torch.enable_grad():
-            output = scene.render(view.camera, background=background, field_mode="frozen")
-            rgb = view.shown(output.rgb, output.alpha, background)
+            output, rgb, target = view.drawn(scene, background)
+            signs = _random_signs(target, seed + number)
+            if view.mask is not None:
+                signs = signs * view.mask.reshape(*target.shape[:2], 1)
             (gradient,) = torch.autograd.grad((rgb * signs).sum(), logits)
         error += (signs * (rgb.detach() - target)).square().sum(dtype=torch.float64)
         value_count += signs.square().sum(dtype=torch.float64)

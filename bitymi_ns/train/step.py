@@ -110,10 +110,8 @@ def view_losses(
         photograph = photograph_target(target, loss, view.mask, background)
         compared = scene.compare(view.camera, photograph, view.correction, field_mode, descent, logits)
     output = shown = compared or scene.render(view.camera, background, field_mode, maps, overdraw_half, descent, logits)
-    if view.correction is not None and isinstance(output, RenderOutput):  # the other one is corrected already
-        rgb = view.shown(output.rgb, output.alpha, background)
-        image = None if output.image is None else torch.cat([rgb, output.image[..., 3:]], -1)
-        shown = replace(output, rgb=rgb, image=image)
+    if isinstance(output, RenderOutput):  # the other one is corrected already
+        shown = replace(output, rgb=view.shown(output.rgb, output.alpha, background))
     terms = objective(shown, target, loss, view.mask, view.depth, view.normal)
     watch.note(scene, step, terms)
     return terms, output
@@ -161,12 +159,13 @@ class Training:
         textured = scene.config.texture == "texels"
         pixels = data.covered * data.image_pixels / max(1, len(data.views))
         self.schedule = Schedule(config, max_steps, data.extent, textured, pixels)
-        self.strategy = Strategy(self.schedule, on_resize, data.image_pixels, data.first_surfels, processes)
+        grown = (on_resize, data.image_pixels, data.first_surfels, processes)
+        self.strategy = Strategy(scene, optimizers, self.schedule, *grown)
         self.exposure = Exposure(config.exposure, data.exif_stops, data.files)
         cameras = [view.camera for view in data.views] if data.cameras is None else data.cameras
         self.poses = Poses(self.schedule, cameras)
         self.announce = announce
-        self.guard = RollbackGuard(scene, optimizers, self.strategy, self.exposure, self.poses, announce)
+        self.guard = RollbackGuard(self.strategy, self.exposure, self.poses, announce)
         self.texels = LearningTexels(scene, self.schedule, processes)
         self.watch = LossWatch()
         self.step_sizes = StepSizes(self.schedule, cameras)
@@ -240,7 +239,7 @@ class Training:
                 self._photometric.append(terms["photometric"].detach())
                 return terms, output
             self.watch.forget()
-            self.guard.failed(self.step, diverged or TrainingDiverged(problem))
+            self.guard.repair(self.step, diverged or TrainingDiverged(problem))
             self.step_sizes.measure(self.scene)
             self._set_rates()
 
@@ -286,11 +285,9 @@ class Training:
         loss = self._mean_over_views(photometric)
         factor = self.schedule.resolution_factor(step)
         try:
-            report = self.strategy.step(
-                step, self.scene, self.optimizers, lambda k, generator: self.views.draw(k, generator, factor)
-            )
+            report = self.strategy.step(step, lambda k, generator: self.views.draw(k, generator, factor))
         except TrainingDiverged as error:  # the optimisers broke the field or all surfels after the last loss
-            report = self.guard.failed(step, error)
+            report = self.guard.repair(step, error)
         else:
             report |= self.guard.after(step, loss)
         if "most_by_memory" in report:

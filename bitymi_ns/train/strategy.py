@@ -22,10 +22,9 @@ from torch import Tensor
 from torch.nn.functional import one_hot
 from torch.optim import Optimizer
 
-from bitymi_ns.ops.backend import cuda_backend
+from bitymi_ns.ops.backend import cuda_backend, dense, kernel
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.parameters import Tensors
-from bitymi_ns.ops.picture_cuda import accumulate_statistics
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
@@ -67,6 +66,8 @@ class Strategy:
 
     def __init__(
         self,
+        scene: Scene,
+        optimizers: Mapping[str, Optimizer],
         schedule: Schedule,
         on_resize: ResizeHook | None = None,
         image_pixels: int = 0,
@@ -75,15 +76,15 @@ class Strategy:
     ) -> None:
         """
         Args:
+            scene: its surfel parameters are replaced when their number changes.
+            optimizers: by surfel parameter name.
             schedule: events and options of the run.
             on_resize: called with the name and the new Parameter when a surfel parameter is replaced.
             image_pixels: total over all training images at full size, for `densify.pixels_per_surfel`; 0: no limit.
             first_surfels: initial number of surfels, for `densify.growth`.
         """
-        self.config = schedule.config
-        self.processes = processes
-        self.schedule = schedule
-        self.on_resize = on_resize
+        self.scene, self.optimizers, self.processes, self.on_resize = scene, optimizers, processes, on_resize
+        self.schedule, self.config = schedule, schedule.config
         self.most = self._most = most_surfels(self.config, image_pixels, first_surfels)
         self.most_by_memory = 0
         # opacity below which a surfel may be replaced: fainter than at the start, and faint enough for a final prune
@@ -129,11 +130,17 @@ class Strategy:
         self.statistics = self.statistics.to(device)
         grad_sum, abs_grad_sum, visible_count, max_radius = self.statistics
         height, width = projection.camera.height, projection.camera.width
+        gradients = (projection.mean2d_grad, projection.mean2d_absgrad)
         if cuda_backend(device):
-            accumulate_statistics(projection, width, height, grad_sum, abs_grad_sum, visible_count, max_radius)
+            grad, absgrad = (None if gradient is None else dense(gradient, projection.radii) for gradient in gradients)
+            rows = dict(zip(STATISTICS, self.statistics, strict=True))
+            size = {"width": width, "height": height}
+            kernel("accumulate_statistics", projection.radii)(
+                radii=projection.radii, grad=grad, absgrad=absgrad, **size, **rows
+            )
             return
         visible = projection.visible
-        for total, gradient in ((grad_sum, projection.mean2d_grad), (abs_grad_sum, projection.mean2d_absgrad)):
+        for total, gradient in zip((grad_sum, abs_grad_sum), gradients, strict=True):
             if gradient is not None:  # None if there was no fragment
                 ndc = (0.5 * width * gradient[:, 0], 0.5 * height * gradient[:, 1])
                 size = torch.hypot(*ndc).nan_to_num(0.0, 0.0, 0.0)
@@ -142,45 +149,34 @@ class Strategy:
         radius = projection.radii.amax(-1).float()
         torch.where(visible, torch.maximum(max_radius, radius), max_radius, out=max_radius)
 
-    def step(self, step: int, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
-        """Densify, reset opacities and prune as scheduled after the optimiser update of `step`.
-
-        Args:
-            step: index of the step that just ended.
-            scene: its surfel parameters are replaced if their number changes.
-            views: samples the views for the scores.
-
-        Returns:
-            Counts of what was done, by name; empty if nothing was due.
-        """
+    def step(self, step: int, views: DrawViews) -> dict[str, float]:
+        """Densify, reset opacities and prune as scheduled after the optimiser update of `step`, the step that just
+        ended. `views`: samples the views for the scores. Returns counts of what was done, by name; empty if nothing was
+        due."""
         report: dict[str, float] = {}
-        if 0 < self.config.densify.max_surfels < len(scene):  # a loaded scene may exceed the limit
-            report |= self._drop_dead(scene, optimizers)
+        if 0 < self.config.densify.max_surfels < len(self.scene):  # a loaded scene may exceed the limit
+            report |= self._drop_dead()
         if step in self.schedule.densify_steps:
-            report |= self._densify(step, scene, optimizers, views)
+            report |= self._densify(step, views)
         if step in self.schedule.reset_steps:
-            report["opacity_reset"] = cap_opacity(
-                scene.surfels, optimizers, self.schedule.reset_opacity(), forget_all=True
-            )
+            highest = self.schedule.reset_opacity()
+            report["opacity_reset"] = cap_opacity(self.scene.surfels, self.optimizers, highest, forget_all=True)
         if step in self.schedule.error_prune_steps:
-            report |= self._error_prune(scene, optimizers, views)
+            report |= self._error_prune(views)
         if step in self.schedule.final_prune_steps:
-            report |= self._final_prune(scene, optimizers, views)
+            report |= self._final_prune(views)
         if report:
-            report["surfels"] = len(scene)
+            report["surfels"] = len(self.scene)
         return report
 
     # ---- densification
 
     @torch.no_grad()
-    def _densify(
-        self, step: int, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews
-    ) -> dict[str, float]:
-        config = self.config.densify
-        report = self._drop_dead(scene, optimizers)
-        scores = multi_view_scores(scene, views(config.views, self.generator), self.config, self.processes)
-        surfels = scene.surfels
-        n, device = len(scene), surfels["means"].device
+    def _densify(self, step: int, views: DrawViews) -> dict[str, float]:
+        config, surfels = self.config.densify, self.scene.surfels
+        report = self._drop_dead()
+        scores = multi_view_scores(self.scene, views(config.views, self.generator), self.config, self.processes)
+        n, device = len(self.scene), surfels["means"].device
         statistics = self.statistics
         if statistics.shape[1] != n:  # no view since the last densification
             statistics = torch.zeros(len(STATISTICS), n, device=device)
@@ -230,9 +226,9 @@ class Strategy:
         keep = (~pruned & ~split).nonzero().flatten()
 
         if len(keep) != n or len(clones) + len(splits) > 0:
-            replace_rows(surfels, optimizers, keep, new, self.on_resize)
-        self.statistics = torch.zeros(len(STATISTICS), len(scene), device=device)
-        cap_opacity(surfels, optimizers, config.opacity_clamp)
+            replace_rows(surfels, self.optimizers, keep, new, self.on_resize)
+        self.statistics = torch.zeros(len(STATISTICS), len(self.scene), device=device)
+        cap_opacity(surfels, self.optimizers, config.opacity_clamp)
         return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
 
     def _heed_memory(self, step: int, n: int, wanted: int, device: torch.device) -> dict[str, float]:
@@ -266,42 +262,37 @@ class Strategy:
         return candidate | (surfels["log_scales"].amax(-1).exp() > config.prune_world * self.schedule.extent)
 
     @torch.no_grad()
-    def _error_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
-        report = self._drop_dead(scene, optimizers)
-        every = torch.ones(len(scene), dtype=torch.bool, device=scene.surfels["means"].device)
+    def _error_prune(self, views: DrawViews) -> dict[str, float]:
+        report = self._drop_dead()
+        every = torch.ones(len(self.scene), dtype=torch.bool, device=self.scene.surfels["means"].device)
         drawn = views(self.schedule.error_views, self.generator)
-        pruned = self._expendable(every, self.config.densify.prune_error, scene, drawn)
-        return report | self._prune(pruned, scene, optimizers)
+        return report | self._prune_least(every, self.config.densify.prune_error, drawn)
 
     @torch.no_grad()
-    def _final_prune(self, scene: Scene, optimizers: Mapping[str, Optimizer], views: DrawViews) -> dict[str, float]:
+    def _final_prune(self, views: DrawViews) -> dict[str, float]:
         """Remove the faint surfels that matter little; after an opacity reset many faint ones do matter."""
-        report, config = self._drop_dead(scene, optimizers), self.config.densify
-        faint = scene.surfels["opacity_logits"].sigmoid() < config.final_prune_opacity
+        report, config = self._drop_dead(), self.config.densify
+        faint = self.scene.surfels["opacity_logits"].sigmoid() < config.final_prune_opacity
         drawn = views(self.schedule.final_views, self.generator)
-        pruned = self._expendable(faint, config.final_prune_error, scene, drawn)
-        return report | self._prune(pruned, scene, optimizers)
+        return report | self._prune_least(faint, config.final_prune_error, drawn)
 
-    def _expendable(self, among: Tensor, share: float, scene: Scene, views: Sequence[View]) -> Tensor:
-        """Select, [N] bool, the surfels `among` [N] bool that change the views least, together by at most a share of
-        the views' squared error (`removal_errors`)."""
+    def _prune_least(self, among: Tensor, relative_error: float, views: Sequence[View]) -> dict[str, float]:
+        """Remove the surfels `among` [N] bool that change the views least, together by at most a part of the views'
+        squared error (`removal_errors`), as far as `min_surfels` allows."""
         seed = int(torch.randint(1 << 31, (), generator=self.generator))
-        added, error = removal_errors(scene, views, self.config, seed, self.processes)
+        added, error = removal_errors(self.scene, views, self.config, seed, self.processes)
         rows = among.nonzero().flatten()
         rows = rows[added[rows].argsort(stable=True)]
-        chosen = torch.zeros_like(among)
-        chosen[rows] = added[rows].cumsum(0) <= share * error
-        return chosen & (added > 0)  # unsampled views may show the others
-
-    def _prune(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
-        """Remove as many of `pruned` [N] bool as `min_surfels` allows."""
-        pruned = self._keep_minimum(pruned, scene.surfels["opacity_logits"], len(scene))
-        self.remove(pruned, scene, optimizers)
+        pruned = torch.zeros_like(among)
+        pruned[rows] = added[rows].cumsum(0) <= relative_error * error
+        pruned &= added > 0  # unsampled views may show the others
+        pruned = self._keep_minimum(pruned, self.scene.surfels["opacity_logits"], len(self.scene))
+        self.remove(pruned)
         return {"pruned": int(pruned.sum())}
 
-    def _drop_dead(self, scene: Scene, optimizers: Mapping[str, Optimizer]) -> dict[str, float]:
+    def _drop_dead(self) -> dict[str, float]:
         """Remove surfels that are not finite or can never be visible again, and the faintest beyond `max_surfels`."""
-        surfels = scene.surfels
+        scene, surfels = self.scene, self.scene.surfels
         if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
             raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")
         finite = finite_rows(scene)
@@ -314,7 +305,7 @@ class Strategy:
             over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
             invisible |= _lowest(logits, finite & ~invisible, over)
         pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
-        self.remove(pruned, scene, optimizers)
+        self.remove(pruned)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
 
     def _keep_minimum(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
@@ -337,14 +328,14 @@ class Strategy:
         return (race / weights).topk(k, largest=False).indices
 
     @torch.no_grad()
-    def remove(self, pruned: Tensor, scene: Scene, optimizers: Mapping[str, Optimizer]) -> None:
+    def remove(self, pruned: Tensor) -> None:
         """Remove the surfels `pruned` [N] bool, with their texels and statistics."""
         if not bool(pruned.any()):
             return
         keep = (~pruned).nonzero().flatten()
-        replace_rows(scene.surfels, optimizers, keep, on_resize=self.on_resize)
-        if isinstance(scene.field, TexelField):
-            scene.field.keep(keep)
+        replace_rows(self.scene.surfels, self.optimizers, keep, on_resize=self.on_resize)
+        if isinstance(self.scene.field, TexelField):
+            self.scene.field.keep(keep)
         if self.statistics.shape[1] == len(pruned):
             self.statistics = self.statistics.index_select(1, keep.to(self.statistics.device))
 

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -15,6 +15,9 @@ from torch.nn.functional import interpolate
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.config import TrainConfig
+
+if TYPE_CHECKING:
+    from bitymi_ns.scene.scene import RenderOutput, Scene
 
 DOWNSCALED_BYTES = 1 << 28  # cache of downscaled images on the CPU; others are downscaled at every use
 COVERED_VIEWS = 8  # views sampled by `covered_share`
@@ -62,6 +65,13 @@ class View(NamedTuple):
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
         """Compose the photograph over a colour [3] (None: black) on a device: [H, W, 3]."""
         return over_background(as_float(self.image.to(device)), background)
+
+    def drawn(self, scene: Scene, background: Tensor | None) -> tuple[RenderOutput, Tensor, Tensor]:
+        """Render the view without gradients of the texture, for a comparison with its photograph: the output, its rgb
+        [H, W, 3] with the photograph's correction, and the photograph [H, W, 3] over the same background."""
+        output = scene.render(self.camera, background, "frozen")
+        rgb = self.shown(output.rgb, output.alpha, background)
+        return output, rgb, self.target(background, rgb.device)
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ def train(device: torch.device, background: str, exposure: str) -> tuple[list[fl
         trainer.advance()
         losses.append(trainer.loss)
     trainer.training.watch.finish(scene)
-    psnr, *_ = evaluate(scene, views, config)
+    psnr = evaluate(scene, views, config).psnr
     return losses, psnr, {name: p.detach().cpu() for name, p in scene.named_parameters()}
 
 

@@ -12,9 +12,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from bitymi_ns import ops
 from bitymi_ns.ops.parameters import GEOMETRY
-from bitymi_ns.ops.picture_cuda import PhotographTarget
 from bitymi_ns.ops.texel import TexelDescent
-from bitymi_ns.ops.training_view import ComparedView, training_view
+from bitymi_ns.ops.training_view import ComparedView, PhotographTarget, training_view
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.scene.field import TexelField

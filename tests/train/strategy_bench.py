@@ -33,7 +33,7 @@ class Bench:
             optimizer.step()  # rate 0: moments only
         densify = {"min_surfels": 1, **densify}
         self.config = TrainConfig(densify=DensifyConfig(**densify))
-        self.strategy = Strategy(Schedule(self.config, 30_000))
+        self.strategy = Strategy(self.scene, self.optimizers, Schedule(self.config, 30_000))
         self.importance = torch.zeros(n, dtype=torch.int64)
         self.prune = torch.zeros(n)
         self.asked = []
@@ -67,7 +67,7 @@ class Bench:
         self.strategy.accumulate(projection)
 
     def step(self, at):
-        return self.strategy.step(at, self.scene, self.optimizers, self.views)
+        return self.strategy.step(at, self.views)
 
     def set(self, name, rows, value):
         with torch.no_grad():

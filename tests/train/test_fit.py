@@ -37,10 +37,8 @@ def test_a_run_on_photographs_that_show_little_sees_full_size_early(make_scene, 
 
 def test_a_short_run_is_a_proper_run(make_scene, views):
     scene, config, seen = make_scene(), TrainConfig(densify=EVERY_EVENT), []
-    before, *_ = evaluate(scene, views[:1], config)
-    log = fit(
-        scene, views[1:], views[:1], config, 200, callback=lambda t, *_: seen.append(len(t.scene)), eval_steps=[100]
-    )
+    before = evaluate(scene, views[:1], config).psnr
+    log = fit(scene, views[1:], views[:1], config, 200, callback=lambda t: seen.append(len(t.scene)), eval_steps=[100])
     assert [entry.step for entry in log.entries] == [100, 200]
     assert log.entries[-1].psnr > before + 3.0
     assert log.entries[-1].loss < 0.12
@@ -58,7 +56,7 @@ def test_the_cap_holds_after_every_step(make_scene, views, cap):
     scene, seen = make_scene(), []
     first = len(scene)
     config = TrainConfig(densify=replace(EVERY_EVENT, max_surfels=cap))
-    fit(scene, views, [], config, 40, callback=lambda t, *_: seen.append(len(t.scene)))
+    fit(scene, views, [], config, 40, callback=lambda t: seen.append(len(t.scene)))
     assert min(first, cap) <= max(seen) <= cap  # how many are pruned depends on the random numbers
     assert all(torch.isfinite(p).all() for p in scene.parameters())
 
@@ -176,7 +174,7 @@ def test_images_with_alpha_and_bytes_and_masks(make_scene, views):
         results.append(terms["photometric"].item())
     assert results[0] == pytest.approx(results[1], abs=1e-6)
     assert results[0] == pytest.approx(results[2], abs=2e-3)
-    assert math.isfinite(evaluate(scene, [View(camera, rgba, mask)], config)[0])
+    assert math.isfinite(evaluate(scene, [View(camera, rgba, mask)], config).psnr)
 
 
 def test_the_colour_behind_the_scene_may_be_given(make_scene, views):

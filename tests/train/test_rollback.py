@@ -52,7 +52,7 @@ def test_a_healthy_run_is_left_alone(make_scene, views):
 @pytest.mark.parametrize("factor", [10.0, 10_000.0])
 def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scene, views, factor):
     scene, config = make_scene(), config_of(factor)
-    start, *_ = evaluate(scene, views, config)
+    start = evaluate(scene, views, config).psnr
     trainer = Trainer(scene, views, config, 120)
     try:
         reports = run(trainer, 120)
@@ -60,7 +60,7 @@ def test_rates_that_are_too_high_end_in_a_recovered_scene_or_a_message(make_scen
         assert "Lower the learning rates" in str(error) and "training diverged at step" in str(error)
         reports = []
     assert not describe_broken(scene)
-    psnr, *_ = evaluate(scene, views, config)
+    psnr = evaluate(scene, views, config).psnr
     assert math.isfinite(psnr) and psnr > start - 3.0
     assert sum("rolled_back" in report for report in reports) == trainer.training.guard.rollbacks or not reports
 
@@ -80,7 +80,7 @@ def test_a_field_that_breaks_on_the_way_is_restored(begun, views):
     assert trainer.optimizers["quats"].param_groups[0]["lr"] == pytest.approx(0.3 * rate)
     assert (scene.field.field_table - good).abs().max() < 0.5
     run(trainer, 50)
-    assert evaluate(scene, views, trainer.config)[0] > 15
+    assert evaluate(scene, views, trainer.config).psnr > 15
 
 
 def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
@@ -108,7 +108,7 @@ def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
 
 def test_views_drawn_worse_than_blank_ones_take_the_run_back(begun, views):
     trainer = begun(100)
-    good, *_ = evaluate(trainer.scene, views, trainer.config)
+    good = evaluate(trainer.scene, views, trainer.config).psnr
     assert trainer.training.guard.window == 20  # windows end with the run
     with torch.no_grad():
         trainer.scene.surfels["sv_rgb"] += 5.0
@@ -116,7 +116,7 @@ def test_views_drawn_worse_than_blank_ones_take_the_run_back(begun, views):
         for _ in range(20):
             trainer.advance()
     assert trainer.training.guard.rollbacks == 1
-    assert evaluate(trainer.scene, views, trainer.config)[0] > good - 3
+    assert evaluate(trainer.scene, views, trainer.config).psnr > good - 3
 
 
 def test_texels_begin_a_window_of_their_own(make_scene, views):

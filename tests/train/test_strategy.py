@@ -176,7 +176,7 @@ def test_surfels_grow_to_the_cap_in_equal_parts_and_reach_it(bench, cap):
     for step in events:
         b.importance = torch.full((4000,), 10)
         b.see(1.0, 1.0)
-        b.strategy.step(step, b.scene, b.optimizers, b.views)
+        b.strategy.step(step, b.views)
         counts.append(len(b.scene))
     assert counts[-1] == cap
     if cap == 2000:  # at most two children per surfel at a time
@@ -208,7 +208,7 @@ def test_parents_of_a_cap_are_drawn_by_error_and_gradient(bench):
 @pytest.mark.parametrize(("views", "surfels"), [(1, 60), (2, 80), (9, 80)])
 def test_the_bound_follows_the_pixels_of_all_photographs(bench, views, surfels):
     b = bench(40)
-    b.strategy = Strategy(Schedule(b.config, 30_000), image_pixels=views * 60 * 150)
+    b.strategy = Strategy(b.scene, b.optimizers, Schedule(b.config, 30_000), image_pixels=views * 60 * 150)
     b.importance = torch.full((40,), 10)
     b.set("log_scales", slice(0, 40), LARGE)
     b.see(1.0, 1.0)

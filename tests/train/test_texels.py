@@ -185,7 +185,7 @@ def test_a_run_with_texels_is_better_than_one_without(textured, make_scene, view
     quality = []
     for scene in (textured(), make_scene(texture=False)):
         fit(scene, views[1:], [], config(resolution_schedule=0), 300)
-        quality.append(evaluate(scene, views[1:], config())[0])
+        quality.append(evaluate(scene, views[1:], config()).psnr)
         assert all(torch.isfinite(p).all() for p in scene.parameters())
     assert quality[0] > quality[1] + 0.3
 
@@ -247,7 +247,7 @@ def test_surfels_that_are_pruned_take_their_texels_along(textured, views) -> Non
     gone = torch.zeros(n, dtype=torch.bool)
     gone[[3, n - 1]] = True
     left = len(field.texels) - int(field.size[gone].prod(1).sum())
-    trainer.training.strategy.remove(gone, scene, trainer.optimizers)
+    trainer.training.strategy.remove(gone)
     assert len(scene) == len(field.size) == len(field.extent) == n - 2
     assert len(field.texels) == len(field.share) == field.tiles.count == left
     with torch.no_grad():
@@ -261,7 +261,7 @@ def test_a_run_that_diverges_goes_back_to_its_texels(textured, views) -> None:
     for _ in range(45):
         trainer.advance()
     gone = torch.arange(len(scene)) == 5
-    trainer.training.strategy.remove(gone, scene, trainer.optimizers)  # since the state it rolls back to
+    trainer.training.strategy.remove(gone)  # since the state it rolls back to
     with torch.no_grad():
         scene.field.texels[7] = float("nan")
         scene.surfels["means"][:] = float("nan")

@@ -222,7 +222,7 @@ class TrainingRun:
         point = {"step": step + 1, **times, "surfels": len(self.scene), **self.training.by_memory}
         shown = ""
         if not math.isnan(quality.psnr):
-            point |= {k: round(value, 4) for k, value in quality._asdict().items() if not math.isnan(value)}
+            point |= {k: round(value, 4) for k, value in vars(quality).items() if not math.isnan(value)}
             shown = f"{quality.psnr:6.2f} dB held out, "
             if exposure.table is not None:
                 shown += f"{quality.mean_exposure_psnr:.2f} dB with the mean exposure, "

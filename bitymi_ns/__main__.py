@@ -5,7 +5,6 @@ import warnings
 
 
 def main() -> int:
-    """Run one command and return its exit status."""
     try:
         from bitymi_ns import exit_messages
     except KeyboardInterrupt:

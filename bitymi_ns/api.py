@@ -176,11 +176,9 @@ def _check_ranges(**ranges: tuple[Tensor, float, float]) -> None:
 
 
 def _logit(share: Tensor) -> Tensor:
-    """Compute logits, clamped to finite values with a straight-through gradient.
-
-    The operations take logits, like those of training, and apply the sigmoid: its slope o (1 - o) is exact as a
-    function of the logit, but in float32 nothing is left of 1 - o where o -> 1.
-    """
+    """Compute logits, clamped to finite values with a straight-through gradient. The operations take logits, like those
+    of training, and apply the sigmoid: its slope o (1 - o) is exact as a function of the logit, but in float32 nothing
+    is left of 1 - o where o -> 1."""
     nearest = share.clamp(1e-12, 1.0 - 8 * torch.finfo(share.dtype).eps)
     return torch.logit(share + (nearest - share).detach())
 

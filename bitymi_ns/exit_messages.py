@@ -41,8 +41,8 @@ def out_of_memory(error: BaseException) -> bool:
 
 
 def line_of(error: BaseException) -> str | None:
-    """Describe an exception for the user: what is wrong, with the file if there is one, and what to do. None: it is a
-    bug, and deserves its traceback."""
+    """Describe an exception for the user: what is wrong, where, and what to do. None: it is a bug, and deserves its
+    traceback."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     if out_of_memory(error):
@@ -78,9 +78,8 @@ def _end_by_default(numbers: Sequence[int]) -> None:
 
 
 def run(command: Callable[[], int]) -> int:
-    """Run a command and return its exit status, also after exceptions that `line_of` describes.
-
-    Ends silently if its output is a closed pipe, as with `| head`."""
+    """Run a command and return its exit status, also after exceptions that `line_of` describes; ends silently if its
+    output is a closed pipe, as with `| head`."""
     changed = end_as_by_ctrl_c()
     try:
         try:
@@ -134,11 +133,8 @@ def outlive_output() -> None:
 
 
 def install(then: Callable[[], str] = str) -> None:
-    """Handle uncaught exceptions of this process as `run` does, in commands of other packages.
-
-    Args:
-        then: returns what to do after memory ran out, beside the usual.
-    """
+    """Handle uncaught exceptions of this process as `run` does, in commands of other packages. `then`: returns what to
+    do after memory ran out, beside the usual."""
     global _then
     _then, before = then, sys.excepthook
     atexit.register(_end_by_default, end_as_by_ctrl_c())  # the interpreter prints exceptions of its own shutdown

@@ -81,12 +81,10 @@ def free_bytes(path: Path) -> int:
 
 
 def size_text(size: int) -> str:
-    """Format a number of bytes in decimal units."""
     return decimal(size)
 
 
 def _nearest(path: Path) -> Path:
-    """Return the path or its nearest existing parent."""
     return next((p for p in (path, *path.parents) if os.path.lexists(p)), Path("/"))
 
 
@@ -105,24 +103,14 @@ def parents_of(path: Path) -> Iterator[None]:
 
 @contextmanager
 def reserved(target: str | Path, check: Callable[[], None] | None = None, tell: Tell = warnings.warn) -> Iterator[Path]:
-    """Lock the path of a file or folder, and repair the remains of a killed process there. Since this writes beside the
-    target, it fails early if nothing can be written there.
+    """Lock the path of a file or folder, and repair the remains of a killed process there; yield it with links
+    resolved. Since this writes beside the target, it fails early if nothing can be written there. Missing parents are
+    created, and removed if they remain empty. Reservations of one thread may be nested.
 
-    Creates missing parents, and removes those that remain empty.
-
-    Args:
-        target: to be written in the block; reservations of one thread may be nested.
-        check: for a folder: raises if the existing one may not be replaced. None: the target is a file.
-        tell: called if the file system has no locks.
-
-    Yields:
-        The target with links resolved.
-
-    Raises:
-        Busy: another process is writing it.
-        OSError: nothing can be written there, or it is a folder instead of a file, or a file or a link to nothing
-            instead of a folder; `reason` says why.
-    """
+    `check`: for a folder: raises if the existing one may not be replaced; None: the target is a file. `tell`: called if
+    the file system has no locks. Raises Busy: another process is writing it. Raises OSError: nothing can be written
+    there, or it is a folder instead of a file, or a file or a link to nothing instead of a folder; `reason` says
+    why."""
     place = Path(os.path.realpath(target))
     kind = errno.EBUSY if os.path.ismount(place) else 0
     if not kind and os.path.lexists(target) and place.is_dir() != (check is not None):
@@ -212,23 +200,11 @@ def _remove(folder: Path) -> None:
 def complete_folder(
     target: str | Path, check: Callable[[], None] = lambda: None, tell: Tell = warnings.warn
 ) -> Iterator[Path]:
-    """Create a temporary folder that replaces the target if the block ends without an exception.
+    """Create a temporary folder, which is yielded, and replaces the target if the block ends without an exception.
 
     After any exception, including KeyboardInterrupt, the target is unchanged. After a kill it is the old or the new
-    folder, or both are beside it until the next writer repairs that.
-
-    Args:
-        target: the folder; missing parents are created.
-        check: raises if the existing target may not be replaced; called before and after the block.
-        tell: called if the file system has no locks.
-
-    Yields:
-        The temporary folder.
-
-    Raises:
-        Busy: another process is writing it.
-        OSError: it cannot be written; `reason` says why.
-    """
+    folder, or both are beside it until the next writer repairs that. `check`: raises if the existing target may not be
+    replaced; called before and after the block. Missing parents are created. Raises as `reserved`."""
     with reserved(target, check, tell) as place:
         new, old = _temporary_paths(place)
         try:
@@ -249,18 +225,10 @@ def complete_folder(
 
 @contextmanager
 def complete_file(path: Path, scratch: Path | None = None, follow: bool = False) -> Iterator[BinaryIO]:
-    """Open a temporary file that replaces `path` if the block ends without an exception.
-
-    Args:
-        path: the file; missing parents are created.
-        follow: write through a link, for a path that the user gave; False: replace the link, for files of a folder that
-            may come from others.
-        scratch: folder on the same file system for the unfinished file; None: that of `path`.
-
-    Raises:
-        Busy: another process is writing it.
-        OSError: it cannot be written; `reason` says why.
-    """
+    """Open a temporary file that replaces `path` if the block ends without an exception; missing parents are created.
+    `follow`: write through a link, for a path that the user gave; False: replace the link, for files of a folder that
+    may come from others. `scratch`: folder on the same file system for the unfinished file; None: that of `path`.
+    Raises Busy: another process is writing it. Raises OSError: it cannot be written; `reason` says why."""
     path = Path(os.path.realpath(path)) if follow else path
     unfinished = (scratch or path.parent) / f".{path.name}{UNFINISHED}"
     with parents_of(path):

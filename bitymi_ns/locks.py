@@ -31,11 +31,8 @@ class Busy(BlockingIOError):
 
 def open_locked(path: Path) -> tuple[BinaryIO, bool]:
     """Open or create a file for writing, and lock it until all processes that have it open close it. Returns the file,
-    and True if it is locked; False if the file system does not support locks.
-
-    Raises:
-        BlockingIOError: another process has the lock.
-        OSError: it cannot be opened, or is refused by `no_links`."""
+    and False if the file system has no locks. Raises BlockingIOError: another process has it; OSError: it cannot be
+    opened, or is refused by `no_links`."""
     while True:
         file = open(path, "r+b", opener=no_links)
         try:
@@ -56,15 +53,8 @@ class Lock:
     the file of a killed process does not block."""
 
     def __init__(self, path: Path, tell: Tell = warnings.warn) -> None:
-        """
-        Args:
-            path: of the file; its folder must exist.
-            tell: called if the file system has no locks; the lock is then ineffective.
-
-        Raises:
-            Busy: another process holds it.
-            OSError: the file cannot be created.
-        """
+        """Lock the file `path`, whose folder must exist. `tell`: called if the file system has no locks; the lock is
+        then ineffective. Raises Busy: another process holds it. Raises OSError: the file cannot be created."""
         self.path, self._owner = path, os.getpid()
         try:
             self._file, locked = open_locked(path)
@@ -122,7 +112,6 @@ def hold(path: Path, tell: Tell = warnings.warn) -> None:
 
 
 def release(path: Path) -> None:
-    """Release the lock of `hold`, if any."""
     lock = held.pop((os.path.realpath(path), threading.get_ident()), None)
     if lock is not None:
         lock.release()

@@ -37,8 +37,6 @@ class PlyError(ValueError):
 
 @dataclass(frozen=True)
 class Element:
-    """Element of a PLY file."""
-
     count: int  # of rows
     names: tuple[str, ...]  # of properties
     row: np.dtype | None  # dtype of a row, a field per property; None if a property is a list
@@ -46,8 +44,6 @@ class Element:
 
 @dataclass(frozen=True)
 class Header:
-    """Header of a PLY file."""
-
     order: str  # byte order, < or >; "" in a text file
     elements: dict[str, Element]  # by name, in the file's order
     start: int  # offset of the rows, bytes

@@ -4,11 +4,8 @@ from pathlib import Path
 
 
 def preset_dir() -> Path:
-    """Find the folder of the presets: inside the installed package, or beside it in a source checkout.
-
-    Raises:
-        FileNotFoundError: it is missing.
-    """
+    """Find the folder of the presets: inside the installed package, or beside it in a source checkout. Raises
+    FileNotFoundError: it is missing."""
     package = Path(__file__).resolve().parent
     for folder in (package / "method_configs", package.parent / "method_configs"):
         if folder.is_dir():
@@ -19,5 +16,4 @@ def preset_dir() -> Path:
 
 
 def preset_names() -> list[str]:
-    """List the names of all presets, sorted."""
     return sorted(path.stem for path in preset_dir().glob("*.yaml"))

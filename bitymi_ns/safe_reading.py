@@ -47,16 +47,14 @@ def read_bytes(path: Path, most: int = MOST_TEXT) -> bytes:
 
 
 def open_text(path: Path, errors: str = "strict") -> TextIO:
-    """Open a text file in the encoding of its byte order mark (written by Windows programs), or else in UTF-8; raises
-    what `open_regular` raises."""
+    """Open a text file in the encoding of its byte order mark (written by Windows programs), or else in UTF-8."""
     file = open_regular(path)
     wide = file.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return TextIOWrapper(file, encoding="utf-16" if wide else "utf-8-sig", errors=errors)
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:
-    """Read a text file of at most `most` bytes, see `open_text`. Raises OSError: it is no regular file, larger, or
-    cannot be read. Raises UnicodeDecodeError: it is no text."""
+    """Read as `open_text` a file of at most `most` bytes. Raises OSError; UnicodeDecodeError: it is no text."""
     with open_text(path) as file:
         _check_size(path, os.fstat(file.fileno()).st_size, most)
         return file.read()
@@ -68,7 +66,7 @@ def _check_size(path: Path, size: int, most: int) -> None:
 
 
 def read_json(path: Path, most: int = MOST_TEXT) -> Any:
-    """Read a JSON file. Raises OSError: see `read_bytes`. Raises ValueError: it is no JSON, or is nested too deeply."""
+    """Read a JSON file. Raises OSError: see `read_bytes`; ValueError: it is no JSON, or is nested too deeply."""
     return json_of(read_bytes(path, most))
 
 
@@ -98,16 +96,12 @@ def reading(
     advice: str = "",
     passing: tuple[type[BaseException], ...] = (),
 ) -> Iterator[None]:
-    """Convert any exception in the block, which reads untrusted data, to a one-line message of place and cause.
+    """Convert any exception in the block, which reads untrusted data, to a one-line message of place and cause. All are
+    caught, because libraries raise many kinds on such data.
 
-    All exceptions are caught, because libraries raise many kinds on such data.
-
-    Args:
-        what: file and entry being read, as in "a.json: frame 3".
-        refuse: raises the exception for a message and its cause.
-        advice: end of the message: what to do, unless memory ran out.
-        passing: exceptions with such a message, which are passed on.
-    """
+    `what`: file and entry being read, as in "a.json: frame 3". `refuse`: raises the exception for a message and its
+    cause. `advice`: end of the message: what to do, unless memory ran out. `passing`: exceptions with such a message,
+    which are passed on."""
     try:
         yield
     except passing:

@@ -31,13 +31,9 @@ class Refused(PermissionError):
 
 
 def no_links(name: str | os.PathLike[str], flags: int) -> int:
-    """Open or create a file for writing without following links; an opener for `open`.
-
-    Raises:
-        Refused: it is a symbolic or hard link, is no regular file, or belongs neither to the user nor to the folder's
-            owner.
-        OSError: it cannot be opened.
-    """
+    """Open or create a file for writing without following links; an opener for `open`. Raises Refused: it is a symbolic
+    or hard link, is no regular file, or belongs neither to the user nor to the folder's owner. Raises OSError: it
+    cannot be opened."""
     path = Path(name)
     empty = flags & os.O_TRUNC
     flags = (flags | os.O_NOFOLLOW) & ~(os.O_CREAT | os.O_EXCL | os.O_TRUNC)
@@ -81,11 +77,8 @@ def _check_owner(path: Path, found: os.stat_result) -> None:
 
 
 def is_left(folder: Path) -> bool:
-    """Return True if a folder left by a killed process exists.
-
-    Raises:
-        Refused: it is no folder, or belongs to somebody else.
-    """
+    """Return True if a folder left by a killed process exists. Raises Refused: it is no folder, or is somebody
+    else's."""
     try:
         found = os.lstat(folder)
     except FileNotFoundError:
@@ -97,16 +90,9 @@ def is_left(folder: Path) -> bool:
 
 
 def own_folder(folder: Path, close: bool = False) -> None:
-    """Create a folder, if missing, that only the user can write to.
-
-    Args:
-        folder: its parent is not checked.
-        close: remove the write permission of others from an existing folder, whose contents do not matter.
-
-    Raises:
-        Refused: it belongs to another user, is writable by others, or is a link.
-        OSError: it cannot be created.
-    """
+    """Create a folder, if missing, that only the user can write to; its parent is not checked. `close`: remove the
+    write permission of others from an existing folder, whose contents do not matter. Raises Refused: it belongs to
+    another user, is writable by others, or is a link. Raises OSError: it cannot be created."""
     with suppress(FileExistsError):
         folder.mkdir(mode=0o755)
         close = True  # an ACL of the parent may have granted more rights
@@ -128,11 +114,7 @@ def is_own(folder: Path) -> bool:
 
 
 def check_no_links(paths: Iterable[Path]) -> None:
-    """Check that no path, if it exists, is a symbolic or hard link; archives can contain both.
-
-    Raises:
-        Refused: a path is a link.
-    """
+    """Check that no path, if it exists, is a link, symbolic or hard; archives can contain both. Raises Refused."""
     for path in paths:
         try:
             found = os.lstat(path)
@@ -143,11 +125,7 @@ def check_no_links(paths: Iterable[Path]) -> None:
 
 
 def foreign_files(folder: Path, made: Iterable[str]) -> list[str]:
-    """List files and folders in a folder, relative to it, that its writer did not create.
-
-    Args:
-        made: names of all files that the writer created, relative to the folder.
-    """
+    """List files and folders in a folder that its writer, of the relative names `made`, did not create."""
     named = [PurePosixPath(name) for name in made]
     files = {str(path) for name in named for path in (name, name.with_name(f".{name.name}{UNFINISHED}"))}
     folders = {str(parent) for name in files for parent in PurePosixPath(name).parents}
@@ -171,15 +149,10 @@ def check_replaceable(
     refuse: Callable[[str], Exception],
     option: str = "--overwrite",
 ) -> None:
-    """Check that a folder is missing or empty, or holds an earlier result alone, which may be replaced.
-
-    Args:
-        what: name of such a result in messages, e.g. "a bundle".
-        made: names of all files of the result in the folder, read after the other checks; None: it has none.
-        overwrite: an earlier result may be replaced.
-        refuse: makes the exception to raise.
-        option: command-line option that sets `overwrite`, for messages.
-    """
+    """Check that a folder is missing or empty, or holds an earlier result alone, which may be replaced; raise `refuse`
+    of a message if not. `what`: name of such a result in messages, e.g. "a bundle". `made`: names of all files of the
+    result in the folder, read after the other checks; None: it has none. `option`: command-line option that sets
+    `overwrite`."""
     if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not folder.is_dir():
@@ -195,11 +168,7 @@ def check_replaceable(
 
 
 def inside(folder: Path, name: str) -> Path:
-    """Join a folder and a relative name.
-
-    Raises:
-        ValueError: the name is empty or leaves the folder.
-    """
+    """Join a folder and a relative name. Raises ValueError: the name is empty or leaves the folder."""
     if not leads_inside(name):
         raise ValueError(f"the name {name!r} leads elsewhere than to a file in the folder: correct it")
     return folder / PurePosixPath(name)
@@ -212,7 +181,6 @@ def leads_inside(name: str) -> bool:
 
 
 def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    """Select the finite numbers of a JSON object, as floats."""
     numbers = {}
     for key, value in values.items():
         if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -227,11 +195,7 @@ def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def json_of(data: str | bytes) -> Any:
-    """Parse untrusted JSON.
-
-    Raises:
-        ValueError: it is no JSON, or is nested too deeply.
-    """
+    """Parse untrusted JSON. Raises ValueError: it is no JSON, or is nested too deeply."""
     try:
         value = json.loads(data)
     except RecursionError:

@@ -40,15 +40,11 @@ _CLOSE = 1.1  # largest ratio of the bytes of an alternative to those wanted, ei
 class Compact:
     """Size and precision of a compact bundle.
 
-    Attributes:
-        share: how much it may add to the mean square error of the pictures against the training photographs, as a share
-            of it, before the texels are tuned; less where lambda would exceed `MAX_LAMBDA`.
-        most_bytes: limit of the bytes of surfels and texels, not used up where the added error is below `ENOUGH`;
-            None = `share` decides.
-        psnr: PSNR on the training photographs that the smallest bundle must reach before the texels are tuned, dB;
-            None = `share` decides.
-        views: training views that are drawn, spread over all.
-    """
+    `share`: how much it may add to the mean square error of the pictures against the training photographs, as a share
+    of it, before the texels are tuned; less where lambda would exceed `MAX_LAMBDA`. `most_bytes` of surfels and texels,
+    not used up where the added error is below `ENOUGH`, or `psnr` in dB on the training photographs, which the smallest
+    bundle must reach before the texels are tuned, decides instead where it is given. `views`: training views that are
+    drawn, spread over all."""
 
     share: float = 0.1
     most_bytes: int | None = None
@@ -56,8 +52,8 @@ class Compact:
     views: int = 8
 
     def fitting(self, megabytes: float, beside: int) -> "Compact":
-        """Limit all files to `megabytes` (10^6 bytes), of which others than surfels, texels, poster, bundle.json and
-        config.yml take `beside` bytes. Raises ValueError: the limit is out of range, or nothing is left for surfels and
+        """Limit all files to `megabytes` (10^6 bytes), of which files beside the scene, its poster, bundle.json and
+        config.yml take `beside` bytes. Raises ValueError: it is out of range, or leaves nothing for surfels and
         texels."""
         if not 0.01 <= megabytes <= 1e5:
             raise ValueError(f"a bundle takes from 0.01 to 100,000 MB, not {megabytes}")
@@ -80,7 +76,6 @@ class RatePoint:
 
     @cached_property
     def bytes(self) -> int:
-        """Count the bytes of surfels and texels; compressed on first use."""
         if self.texels is not None:
             return self.baked.codes.nbytes() + self.texels.nbytes()
         return self.baked.codes.nbytes() + len(streams.compress(residual_codes(self.baked.texels)).data)
@@ -99,8 +94,7 @@ class Coder:
         held_out: Sequence[View] = (),
     ) -> None:
         """Measure `baked`, with lean view colours, in the training views; without any the reference steps are taken.
-        `background`: [3] colour behind the scene. `held_out`: views on which alternatives are stated; without any the
-        training views."""
+        Alternatives are stated on the `held_out` views, without any on the training views. `background`: [3]."""
         self._baked, self._pictures = baked, Pictures(views, background, options.views, baked.device)
         self._held_out = Pictures(held_out, background, options.views, baked.device)
         scene = baked.unquantised()
@@ -118,7 +112,6 @@ class Coder:
 
     @property
     def measured(self) -> bool:
-        """True where there are views to measure with."""
         return self._pictures.views > 0
 
     def allowed(self, share: float) -> float:
@@ -126,7 +119,6 @@ class Coder:
         return self.error + max(LEAST_ERROR, share * self.error)
 
     def _view_colors(self, lmbda: float) -> dict[str, Tensor]:
-        """Choose the view colours at a lambda; none if they were not reduced or there are no views."""
         return self._baked.colors.at(lmbda) if self._baked.colors is not None and self.measured else {}
 
     @torch.no_grad()
@@ -174,25 +166,21 @@ def compacted(
     """Round the surfels of a bake to the values of a compact bundle, in Morton order, and choose the coding of the
     texels. Arguments as of `Coder`. Raises ValueError: the target cannot be reached."""
     options = options or Compact()
-    return choose(Coder(baked, views, background, options, progress, held_out), options, progress)
-
-
-def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> Rounded:
-    """Search lambda and code as `compacted`, with a coder made for the same views."""
+    coder = Coder(baked, views, background, options, progress, held_out)
     if options.most_bytes is not None:
         enough = coder.allowed(ENOUGH) if coder.measured else -math.inf
         most = 0.97 * options.most_bytes
         more, less = _search(
             coder, lambda point: 0.0 if point.bytes > most or point.error <= enough else math.inf, progress
         )
-        found = more if more.bytes <= most else less
-        if found.bytes > options.most_bytes:
+        chosen = more if more.bytes <= most else less
+        if chosen.bytes > options.most_bytes:
             raise ValueError(
-                f"{options.most_bytes:,} bytes are too few for {len(found.baked.rows):,} surfels, which take at least "
-                f"{found.bytes:,} with their texels: ask for more, or train with fewer surfels"
+                f"{options.most_bytes:,} bytes are too few for {len(chosen.baked.rows):,} surfels, which take at least "
+                f"{chosen.bytes:,} with their texels: ask for more, or train with fewer surfels"
             )
     elif not coder.measured:
-        found = coder.at(START)
+        chosen = coder.at(START)
     elif options.psnr is not None:
         if coder.psnr < options.psnr:
             raise ValueError(
@@ -200,17 +188,15 @@ def choose(coder: Coder, options: Compact, progress: Progress = no_progress) -> 
                 "reached: ask for less, or train for longer"
             )
         lost = max(1e-6, coder.psnr - options.psnr)
-        found, _ = _search(coder, lambda point: (coder.psnr - point.psnr) / lost, progress)
+        chosen, _ = _search(coder, lambda point: (coder.psnr - point.psnr) / lost, progress)
     else:
-        allowed = coder.allowed(options.share)
-        added = allowed - coder.error
-        found, _ = _search(coder, lambda point: (point.error - coder.error) / added, progress, most=MAX_LAMBDA)
-    baked = found.baked
+        added = coder.allowed(options.share) - coder.error
+        chosen, _ = _search(coder, lambda point: (point.error - coder.error) / added, progress, most=MAX_LAMBDA)
+    baked = chosen.baked
     if options.most_bytes is not None:
-        most, binds = options.most_bytes - baked.codes.nbytes(), found.error > enough
-        baked = replace(baked, most_bytes=most, fill=binds)
-    mse = max(0.0, found.error - coder.error) if coder.measured else None
-    rounding = Rounding(mse=mse, steps=dict(baked.codes.steps), alternatives=_alternatives(coder, found))
+        baked = replace(baked, most_bytes=options.most_bytes - baked.codes.nbytes(), fill=chosen.error > enough)
+    mse = max(0.0, chosen.error - coder.error) if coder.measured else None
+    rounding = Rounding(mse=mse, steps=dict(baked.codes.steps), alternatives=_alternatives(coder, chosen))
     return baked.stating(rounding=rounding, view_color=_thinned(baked))
 
 
@@ -218,7 +204,7 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | 
     """Measure bytes and PSNR at about half and twice the bytes, relative to the chosen; None without views."""
     if not coder.measured:
         return None
-    found, base = [], coder.at(chosen.lmbda, held_out=True).psnr
+    alternatives, base = [], coder.at(chosen.lmbda, held_out=True).psnr
     for wanted, factor in ALTERNATIVES.items():
         tried = [(0.0, 0.0)]  # logarithms of lambda and bytes over the chosen ones
         step = math.log(factor)
@@ -227,39 +213,37 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | 
             tried.append((step, math.log(other.bytes / chosen.bytes)))
             if abs(tried[-1][1] - math.log(wanted)) < math.log(_CLOSE):
                 break
-            (a, low), (b, high) = sorted(tried, key=lambda each: abs(each[1] - math.log(wanted)))[:2]
+            (a, low), (b, high) = sorted(tried, key=lambda point: abs(point[1] - math.log(wanted)))[:2]
             if low == high:
                 break
             step = max(-12.0, min(12.0, a + (math.log(wanted) - low) * (b - a) / (high - low)))
-        found.append((other.bytes / chosen.bytes, other.psnr - base))
-    return found
+        alternatives.append((other.bytes / chosen.bytes, other.psnr - base))
+    return alternatives
 
 
 def _search(
     coder: Coder, excess: Callable[[RatePoint], float], progress: Progress, most: float = math.inf
 ) -> tuple[RatePoint, RatePoint]:
     """Bisect lambda up to `most`, until the excess is 0.9 to 1: the last passing point (excess at most 1) and the first
-    failing one.
-
-    A finite excess above 0 is about proportional to lambda, and gives the next one. If no point passes, or none fails,
-    the nearest that was tried is returned instead."""
-    low, high, found = None, None, {}
+    failing one, or the nearest that was tried. A finite excess above 0 is about proportional to lambda, and gives the
+    next one."""
+    low, high, points = None, None, {}
     lmbda = min(START, most)
     for step in range(_SEARCH):
-        found[lmbda] = coder.at(lmbda)
+        points[lmbda] = coder.at(lmbda)
         progress("choosing the precision", step + 1, _SEARCH)
-        share = excess(found[lmbda])
-        low, high = (lmbda, high) if share <= 1 else (low, lmbda)
-        found = {tried: found[tried] for tried in {low, high, min(found), max(found)} - {None}}  # frees memory
-        if low == most or 0.9 <= share <= 1:
+        ratio = excess(points[lmbda])
+        low, high = (lmbda, high) if ratio <= 1 else (low, lmbda)
+        points = {tried: points[tried] for tried in {low, high, min(points), max(points)} - {None}}  # frees memory
+        if low == most or 0.9 <= ratio <= 1:
             break
         least, largest = low or lmbda / 8, high or min(most, lmbda * 8)
-        guess = 0.95 * lmbda / share if 0 < share < math.inf else 0.0
+        guess = 0.95 * lmbda / ratio if 0 < ratio < math.inf else 0.0
         if not 1.05 * least < guess < largest / 1.05:
             guess = math.sqrt(least * largest) if low and high else least if low is None else largest
         lmbda = guess
     progress("choosing the precision", _SEARCH, _SEARCH)
-    return found[min(found) if low is None else low], found[max(found) if high is None else high]
+    return points[min(points) if low is None else low], points[max(points) if high is None else high]
 
 
 def _thinned(baked: Rounded) -> ViewColorError | None:

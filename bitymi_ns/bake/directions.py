@@ -36,24 +36,18 @@ def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Di
 
     A surfel has the directions of the views that see it and BETWEEN others: random points of triangles between three of
     these, each triangle enlarged by a quarter, with the same random numbers for every surfel. A surfel that no view
-    sees has SPHERE directions.
-
-    Args:
-        means: [N, 3] world positions.
-        seen: [V, N] bool, the views that see each surfel.
-        centers: [V, 3] float64 camera centres, world.
-    """
+    sees has SPHERE directions. `means`: [N, 3], world. `seen`: [V, N] bool. `centers`: [V, 3] float64 camera centres,
+    world."""
     count = seen.sum(0)  # [N]
     order = torch.argsort(count, stable=True)
     unseen = int((count == 0).sum())
     for rows in order[:unseen].split(_CHUNK // SPHERE):
         unit = fibonacci_sphere(SPHERE).to(means).expand(len(rows), -1, -1)
-        valid = torch.ones(unit.shape[:2], dtype=torch.bool, device=means.device)
-        yield Directions(rows, unit, valid, 0, rows.new_zeros(len(rows), 0))
+        yield Directions(rows, unit, torch.ones_like(unit[..., 0], dtype=torch.bool), 0, rows.new_zeros(len(rows), 0))
     g = torch.Generator().manual_seed(0)
     lot = torch.rand(BETWEEN, 3, generator=g).to(means)
-    share = -torch.rand(BETWEEN, 3, generator=g).clamp(min=1e-6).log()  # normalised: uniform over the triangle
-    share = (1 / 3 + _REACH * (share / share.sum(1, keepdim=True) - 1 / 3)).to(means)
+    corner_weight = -torch.rand(BETWEEN, 3, generator=g).clamp(min=1e-6).log()  # normalised: uniform over the triangle
+    corner_weight = (1 / 3 + _REACH * (corner_weight / corner_weight.sum(1, keepdim=True) - 1 / 3)).to(means)
     rest = order[unseen:]
     while len(rest):
         # the last of a chunk is seen by the most views
@@ -65,7 +59,6 @@ def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Di
         unit = F.normalize(means[rows].double()[:, None] - centers[index].to(means.device), dim=2).to(means)
         drawn = (lot * count[rows, None, None]).long().flatten(1)[..., None].expand(-1, -1, 3)
         corners = unit.gather(1, drawn).unflatten(1, (BETWEEN, 3))
-        between = F.normalize((corners * share[..., None]).sum(2), dim=2)
-        there = torch.ones(len(rows), BETWEEN, dtype=torch.bool, device=means.device)
-        valid = torch.cat([by_view.gather(1, index), there], dim=1)
+        between = F.normalize((corners * corner_weight[..., None]).sum(2), dim=2)
+        valid = F.pad(by_view.gather(1, index), (0, BETWEEN), value=True)
         yield Directions(rows, torch.cat([unit, between], dim=1), valid, most, index)

@@ -17,13 +17,9 @@ FEWEST_VIEWS = 4  # with fewer views nothing is optimised, except by `tune_atlas
 
 
 class EarlyStopping(Generic[S]):
-    """Best state by the PSNR of validation views.
-
-    Attributes:
-        best: the state with the highest PSNR, `first` included; without validation views, the last.
-        curve: (step, dB over the validation views) of every evaluation.
-        done: steps before the last evaluation.
-    """
+    """Best state by the PSNR of validation views: `best` is the state with the highest PSNR, the first included, or
+    without validation views the last; `curve` has (step, dB) of every evaluation, `done` the steps before the last
+    one."""
 
     def __init__(self, steps: int, checks: int, patience: int, psnr: float, first: S) -> None:
         """Begin with a state and the PSNR of the views before the first step, dB; NaN without any. `steps`: maximum
@@ -33,7 +29,6 @@ class EarlyStopping(Generic[S]):
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
 
     def due(self, done: int) -> bool:
-        """Return True if the validation views are evaluated after this step."""
         return done % self._every == 0 or done == self._steps
 
     def update(self, done: int, psnr: float, state: Callable[[], S]) -> bool:
@@ -51,7 +46,6 @@ class EarlyStopping(Generic[S]):
         return not all(p < highest for _, p in self.curve[-self._patience :])
 
     def statistics(self, views: int, validation_views: int, seconds: float, cpu_seconds: float) -> FineTuning:
-        """Collect the statistics of the optimisation."""
         best_step, best = max(self.curve, key=lambda point: point[1], default=(self.done, math.nan))
         return FineTuning(
             views=views,
@@ -79,7 +73,6 @@ def evaluate(
 
 
 def gain(before: float, after: float) -> Gain:
-    """Compare two PSNRs, dB."""
     return Gain(before=round(before, 4), after=round(after, 4))
 
 
@@ -87,5 +80,5 @@ def validation_split(views: Sequence[View], every: int) -> tuple[Sequence[View],
     """Split into validation views, every `every`-th (0: none), and training views; each is read on access."""
     rows = range(len(views))
     parts = [i for i in rows if every and i % every == 0], [i for i in rows if not every or i % every]
-    held, trained = (OnDemand(len(part), lambda i, part=part: views[part[i]]) for part in parts)
-    return held, trained
+    validation, trained = (OnDemand(len(part), lambda i, part=part: views[part[i]]) for part in parts)
+    return validation, trained

@@ -8,11 +8,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import TexelAlpha
-from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.visibility import Visibility, visibility
+from bitymi_ns.scene.visibility import Visibility
 
 POINTS = 256  # points of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame
 
@@ -35,29 +33,17 @@ class BakeInput:
         return None if self.views is None else self.views.in_front
 
     def of(self, rows: Tensor) -> BakeInput:
-        """Select surfels by rows or a mask."""
         surfels = {name: value[rows] for name, value in self.surfels.items()}
         rows = torch.nonzero(rows).squeeze(1) if rows.dtype == torch.bool else rows
         alpha, views = (None if part is None else part.of(rows) for part in (self.alpha, self.views))
         return replace(self, surfels=surfels, alpha=alpha, views=views)
 
-    def with_visibility(self, options: BakeOptions, progress: Progress = no_progress) -> BakeInput:
-        """Add the visibility, where there are cameras and the options need it."""
-        if not self.cameras or not (options.drop_unseen or options.tolerance > 0):
-            return self
-        seen = visibility(self.surfels, self.cameras, self.near, self.weight_bound, progress, self.alpha)
-        return replace(self, views=seen)
-
 
 def photo_resolution(inputs: BakeInput) -> Tensor | None:
-    """Sample the resolution of the photographs at points of the scene (`scene/sampling.py`).
-
-    Returns:
-        [P, 4] float32 on the CPU: positions of surfels, evenly chosen from those that views show, and the geometric
-        mean over these views of focal length / depth, pixels per unit; None without views.
-
-    Without visibility, a view shows the surfels whose centres project into its image.
-    """
+    """Sample the resolution of the photographs at points of the scene (`scene/sampling.py`): [P, 4] float32 on the CPU,
+    positions of surfels, evenly chosen from those that views show, and the geometric mean over these views of focal
+    length / depth, pixels per unit; None without views. Without visibility, a view shows the surfels whose centres
+    project into its image."""
     if not inputs.cameras:
         return None
     means = inputs.surfels["means"]

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -32,17 +33,20 @@ from bitymi_ns.trust import listed
 
 @torch.no_grad()
 def trained_texels(scene: BakeableScene, options: BakeOptions) -> Trained:
-    """Bake a scene whose texels were trained: all of its tiles, view colours and drawable surfels; `prune_and_resample`
-    then drops what the options say. Without texels no surfel has a tile. Raises ValueError: no surfel is left, or the
-    atlas would be too large."""
+    """Bake a scene whose texels were trained, or has none: all of its tiles, view colours and drawable surfels, for
+    `prune_and_resample`. Raises ValueError: no surfel is left, or the atlas would be too large."""
     rows, left_out = drawable(scene.surfels)
     trained = len(scene.surfels["means"])
     if len(rows) == 0:
-        raise ValueError(f"no surfel is left to bake of {trained}: left out {left_out.model_dump()}")
+        raise ValueError(f"no surfel is left to bake of {trained}: left out {dict(left_out)}")
     surfels = {name: value.detach()[rows].float().cpu() for name, value in scene.surfels.items()}
     device, rows, count = rows.device, rows.cpu(), len(rows)
     if isinstance(scene.field, TexelField):
-        tiles = _tiles_of(scene.field, rows)
+        field = copy.deepcopy(scene.field).cpu()
+        field.keep(rows)
+        bare = field.size.long().prod(1) == 1  # their one texel is their constant
+        texels = joined(field.texels.detach().float(), None if field.alpha is None else field.alpha.detach().float())
+        tiles = Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
     else:
         none = torch.zeros(count, 2, dtype=torch.int32)
         tiles = Tiles(none, torch.full((count,), options.extent), torch.zeros(count, 3))
@@ -53,15 +57,6 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Trained:
     if isinstance(scene.field, TexelField):
         stage = stage.stating(texels=KeptTexels(learned=stage.packing.texels))
     return stage
-
-
-def _tiles_of(field: TexelField, rows: Tensor) -> Tiles:
-    """Copy the tiles of the surfels `rows` to the CPU."""
-    field = copy.deepcopy(field).cpu()
-    field.keep(rows)
-    bare = field.size.long().prod(1) == 1  # their one texel is their constant
-    texels = joined(field.texels.detach().float(), None if field.alpha is None else field.alpha.detach().float())
-    return Tiles(torch.where(bare[:, None], 0, field.size), field.extent.float(), texels)
 
 
 FEWEST_PASSES = 4  # steps of polish or fine-tuning per photograph; more may gain where there are fewer
@@ -75,7 +70,9 @@ class RefineOptions:
 
     polish: PolishOptions | None = None  # of texels and surfels together; None = none
     tune: TuneOptions | None = None  # of texels alone, after that; None = none
-    train: TrainConfig = field(default_factory=TrainConfig)  # options of the training, for the rates of the polish
+    train: TrainConfig = dataclasses.field(
+        default_factory=TrainConfig
+    )  # options of the training, for the rates of the polish
     compact: Compact | None = None  # rounding for a compact bundle, before the texels are tuned alone; None = none
 
     @classmethod
@@ -89,15 +86,11 @@ class RefineOptions:
         train: TrainConfig | None = None,
         compact: Compact | None = None,
     ) -> RefineOptions:
-        """Choose the steps by the kind of the scene's texture.
+        """Choose the steps by the kind of the scene's texture: texels, a field, or none, which nothing refines.
 
-        Args:
-            scene: trained, with its texture as texels, as a field, or without texture.
-            polish_steps: 0 = no polish; None = none for texels, which training has learned; for a field 300, or
-                `FEWEST_PASSES` for each photograph where that is more.
-            tune_steps: 0 = no fine-tuning; None = `STEPS_AFTER_LEARNING`, or 400 where a field is not polished.
-            cache_bytes, train, compact: as in `TuneOptions` and here.
-        """
+        `polish_steps`: 0 = no polish; None = none for texels, which training has learned; for a field 300, or
+        `FEWEST_PASSES` for each photograph where that is more. `tune_steps`: 0 = no fine-tuning; None =
+        `STEPS_AFTER_LEARNING`, or 400 where a field is not polished."""
         train = TrainConfig() if train is None else train
         if scene.field is None:
             return cls(train=train, compact=compact)
@@ -122,22 +115,14 @@ def bake(
     progress: Progress = no_progress,
     held_out: Sequence[View] = (),
 ) -> Coded:
-    """Bake a trained scene, optimise it against the photographs, and encode it for a bundle.
+    """Bake a trained scene, optimise it against the photographs, and encode it for a bundle; the scene's device does
+    the work.
 
     Stages: tiles of the trained texels, or of the field; polish of texels and surfels (field only); reduction of tiles
     and view colours; rounding of the surfels (compact only); fine-tuning of the texels; coding; certificate.
-
-    The scene's device does the work.
-
-    Args:
-        cameras: of the training views.
-        photographs: the training views, with the corrections that training found.
-        background: [3] colour behind the scene.
-        held_out: views of which the gains are stated; they decide nothing.
-
-    Raises:
-        ValueError: no surfel is left, an option is out of range or for a field alone, or the atlas would be too large.
-    """
+    `photographs`: the training views, with the corrections that training found; `cameras`: theirs. `background`: [3].
+    `held_out`: views of which the gains are stated; they decide nothing. Raises ValueError: no surfel is left, an
+    option is out of range or for a field alone, or the atlas would be too large."""
     options.check()
     of_fields = ("r_min", "r_max", "extent", "local_voxel")
     given = [name for name in of_fields if getattr(options, name) != getattr(BakeOptions, name)]

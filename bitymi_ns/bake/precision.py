@@ -21,12 +21,8 @@ PER_BIT = 2.0 * math.log(2.0)  # relative fall, per bit, of an error proportiona
 
 
 class Pictures:
-    """Training views sampled for the comparison of renderings with photographs.
-
-    Attributes:
-        views: how many there are.
-        numbers: how many colour values their unmasked pixels have, three each.
-    """
+    """Training views sampled for the comparison of renderings with photographs: how many there are, and how many colour
+    values (`numbers`) their unmasked pixels have, three each."""
 
     def __init__(
         self, views: Sequence[View], background: Tensor, most: int, device: torch.device | str = "cpu"
@@ -55,7 +51,6 @@ class Pictures:
         return sum(_square(*pair) for pair in pairs) / max(1, self.views)
 
     def psnr(self, pictures: Sequence[Tensor]) -> float:
-        """Average the PSNR, dB, against the photographs."""
         pairs = zip(pictures, self._targets, self._masks, strict=True)
         return sum(psnr(*pair) for pair in pairs) / max(1, self.views)
 
@@ -72,10 +67,9 @@ class ColumnNoise:
     counts: Mapping[str, int]  # numbers of the column
 
     def steps(self, lmbda: float) -> dict[str, float]:
-        """Choose the steps at which one more bit per number of a column lowers the error by lambda per bit.
-
-        A column whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number. `lmbda`:
-        mean square error of the images per bit; 0 = unknown: take the reference steps."""
+        """Choose the steps at which one more bit per number of a column lowers the error by lambda per bit: a column
+        whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number. `lmbda`: mean square
+        error of the images per bit; 0 = unknown: take the reference steps."""
         if lmbda == 0:
             return dict(REFERENCE)
         return {name: _step(name, lmbda * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}
@@ -118,7 +112,6 @@ def _column(scene: BakedScene, codes: SurfelCodes, rounded: Mapping[str, Tensor]
 
 
 def _step(name: str, error: float, noise: float) -> float:
-    """Compute the step that adds this error."""
     wanted = math.sqrt(error / noise) / REFERENCE[name] if noise > 0 else WIDEST
     return REFERENCE[name] * min(WIDEST, max(NARROWEST, wanted))
 

@@ -1,5 +1,6 @@
 """Reduction of a bake: invisible and unstorable surfels are dropped, tiles and view colours reduced."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -17,10 +18,11 @@ from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
+from bitymi_ns.scene.visibility import visibility
 
 
-def drawable(surfels: Tensors) -> tuple[Tensor, LeftOut]:
-    """Find the rows [N] int64 that can be drawn and stored; count those left out, by reason."""
+def drawable(surfels: Tensors) -> tuple[Tensor, Counter[str]]:
+    """Find the rows [N] int64 that can be drawn and stored; count those left out, by field of `LeftOut`."""
     finite = torch.stack([value.isfinite().unsqueeze(-1).flatten(1).all(1) for _, value in surfels.items()]).all(0)
     scales = surfels["log_scales"].exp()
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
@@ -28,42 +30,40 @@ def drawable(surfels: Tensors) -> tuple[Tensor, LeftOut]:
     finite &= torch.isfinite(turned) & (turned > 1e-12)
     storable = finite & within(surfels, kind_of(surfels))
     transparent = storable & (surfels["opacity_logits"].sigmoid() < ALPHA_MIN)
-    kept = torch.nonzero(storable & ~transparent).squeeze(1)
-    return kept, LeftOut(
-        not_finite=int((~finite).sum()),
-        beyond_limits=int((finite & ~storable).sum()),
-        transparent=int(transparent.sum()),
-    )
+    counts = {"not_finite": ~finite, "beyond_limits": finite & ~storable, "transparent": transparent}
+    left_out = Counter({reason: int(mask.sum()) for reason, mask in counts.items()})
+    return torch.nonzero(storable & ~transparent).squeeze(1), left_out
 
 
 def drop_unseen(
     baked: Trained, cameras: Sequence[Camera], progress: Progress = no_progress
 ) -> tuple[Trained, BakeInput]:
     """Leave out, and count, the surfels that cannot be drawn or stored and, if the options say so, those that no view
-    blends. Also returns the kept surfels and their visibility, on the device of the work. Raises ValueError: no surfel
-    is left."""
+    blends. Also returns the kept surfels and their visibility, on the bake's device. Raises ValueError: none is
+    left."""
     scene, device = baked.scene, baked.device
     rows, gone = drawable(scene.surfels)
     surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
     alpha = None if baked.alpha is None else baked.alpha.of(rows).to(device)
-    moved = [camera.to(device) for camera in cameras]
-    inputs = BakeInput(surfels, moved, scene.near, scene.weight_bound, alpha=alpha)
-    inputs = inputs.with_visibility(baked.options, progress)
-    if inputs.views is not None and baked.options.drop_unseen:
-        seen = inputs.views.transmittance > 0
-        inputs, rows, gone = inputs.of(seen), rows[seen.cpu()], gone.replace(unseen=int((~seen).sum()))
+    moved, views = [camera.to(device) for camera in cameras], None
+    if moved and (baked.options.drop_unseen or baked.options.tolerance > 0):
+        views = visibility(surfels, moved, scene.near, scene.weight_bound, progress, alpha)
+    inputs = BakeInput(surfels, moved, scene.near, scene.weight_bound, views, alpha)
+    if views is not None and baked.options.drop_unseen:
+        seen = views.transmittance > 0
+        inputs, rows, gone["unseen"] = inputs.of(seen), rows[seen.cpu()], int((~seen).sum())
     if len(rows) == 0:
         raise ValueError("no surfel is left to bake")
     kept = torch.zeros(len(baked.rows), dtype=torch.bool)
     kept[rows] = True
-    left_out = baked.left_out.replace(**{name: (getattr(baked.left_out, name) or 0) + n for name, n in gone if n})
+    left_out = baked.left_out.copy()
+    left_out.update(+gone)  # without reasons that left out none
     return replace(baked.only(kept), left_out=left_out), inputs
 
 
 @torch.no_grad()
 def prune_and_resample(baked: Trained, cameras: Sequence[Camera], progress: Progress = no_progress) -> Reduced:
-    """Drop surfels as `drop_unseen` does, and reduce tiles and view colours by the bake's options. `cameras`: training
-    views. Raises ValueError: no surfel is left."""
+    """Drop surfels as `drop_unseen` does, and reduce tiles and view colours by the bake's options."""
     result, inputs = drop_unseen(baked, cameras, progress)
     surfels, colors, view_color = reduce_view_colors(inputs, baked.options, progress)
     if baked.options.tolerance > 0 and result.textured:
@@ -75,7 +75,7 @@ def prune_and_resample(baked: Trained, cameras: Sequence[Camera], progress: Prog
     counts = KeptSurfels(
         trained=result.trained,
         kept=len(result.rows),
-        left_out=result.left_out,
+        left_out=LeftOut(**result.left_out),
         without_tile=int((result.packing.tiles[:, 3] == 0).sum()),
     )
     texels = result.statistics.texels

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -16,7 +17,7 @@ from bitymi_ns.bake.view_colors import ColorChoices
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.poster import draw_poster
 from bitymi_ns.bundle.read import Bundle
-from bitymi_ns.bundle.statistics import AtlasCost, LeftOut, Statistics
+from bitymi_ns.bundle.statistics import AtlasCost, Statistics
 from bitymi_ns.bundle.write import write_bundle
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing, pack
@@ -80,7 +81,6 @@ class Stage:
 
     @property
     def textured(self) -> bool:
-        """True where any surfel has a tile."""
         return self.packing.texels > 0
 
     @cached_property
@@ -105,12 +105,11 @@ class Stage:
         return replace(self.scene, atlas=pages, offset=0.0, scale=1.0, alpha_scale=0.0 if opaque else 1.0)
 
     def stating(self: S, **parts: Any) -> S:
-        """Replace parts of the statistics."""
         return replace(self, statistics=self.statistics.replace(**parts))
 
     def become(self, stage: type[S], **own: Any) -> S:
         """Go on to another stage with what every stage has; `own`: what differs, and what that stage adds."""
-        return stage(**{each.name: getattr(self, each.name) for each in fields(Stage)} | own)
+        return stage(**{part.name: getattr(self, part.name) for part in fields(Stage)} | own)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,15 +117,13 @@ class Trained(Stage):
     """Surfels with all terms of their view colours, and tiles as they were trained or read from a field."""
 
     trained: int  # surfels of the scene
-    left_out: LeftOut  # those of them that are not here
+    left_out: Counter[str]  # numbers of those that are not here, by field of `LeftOut`
 
     def with_surfels(self, surfels: Mapping[str, Tensor]) -> Trained:
-        """Replace the parameters of the N surfels; their tiles stay."""
         given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
         return replace(self, scene=replace(self.scene, surfels=given))
 
     def with_tiles(self, tiles: Tiles) -> Trained:
-        """Replace the tiles of the N surfels and lay them out."""
         return replace(self, **laid_out(self.scene, tiles, self.options))
 
     def with_colors(self, colors: Tensor) -> Trained:
@@ -152,7 +149,6 @@ class Reduced(Stage):
     colors: ColorChoices | None  # view colours of fewer terms; None = a tolerance of 0, which keeps all of them
 
     def encoded(self, progress: Progress = no_progress) -> Coded:
-        """Encode the texels in pages."""
         means = tile_means(self.texels, self.sizes)
         if not self.textured:
             return _coded(self, means)
@@ -244,9 +240,8 @@ def export(
     first: Camera | None = None,
     **options: Any,
 ) -> Bundle:
-    """Write a bundle; returns and raises as `write_bundle`. `background`: colour behind the surfels. `statistics`:
-    added to those of the bake. `first`: camera of the poster, the one with which viewers start: the first held-out one
-    of cameras.json, else its first; None = no poster."""
+    """Write a bundle; returns and raises as `write_bundle`. `statistics`: added to those of the bake. `first`: camera
+    with which viewers start, for the poster; None = no poster."""
     return write_bundle(
         folder,
         baked.scene,
@@ -288,5 +283,4 @@ def encoded_texels(
 
 
 def _range_of(texels: Tensor, packing: Packing, options: BakeOptions) -> Range:
-    """Choose the range of values of the tiles."""
     return choose_range(texels.numpy()[packing.of_tiles], options.range, options.range_samples, options.seed)

@@ -23,18 +23,12 @@ _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is eva
 def listed_errors(
     difference: Tensor, sizes: Tensor, shown: TileVisibility, chunk: int = 1 << 18
 ) -> tuple[Tensor, Tensor]:
-    """Measure differences of texels as the closest training view shows them.
+    """Measure differences [T, 3] of texels, in the order of `ops.TexelTiles` with one texel for a surfel without a
+    tile, as the closest training view shows them. `sizes`: [N, 2] sides of the tiles; (0, 0) = none. `shown`: N rows.
+    `chunk`: texels taken at once (a tile is never split).
 
-    Args:
-        difference: [T, 3] in the order of `ops.TexelTiles`, with one texel for a surfel without a tile.
-        sizes: [N, 2] sides of the tiles; (0, 0) = none.
-        shown: how much of the tiles is seen, N rows.
-        chunk: texels taken at once (a tile is never split).
-
-    Returns:
-        [N] root mean squares, in 8-bit steps, of the differences times the largest blending weight of a fragment at the
-        texel; and [N] bool, whether any fragment of the surfel gets a residual.
-    """
+    Returns [N] root mean squares, in 8-bit steps, of the differences times the largest blending weight of a fragment at
+    the texel; and [N] bool, whether any fragment of the surfel gets a residual."""
     errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
     first, bare = first_texels(sizes), torch.nonzero(sizes[:, 0] == 0).squeeze(1)
     constants = (
@@ -50,15 +44,14 @@ def listed_errors(
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
     """Compute the pixels per scale unit [N, 2] of every surfel along u and v in the view that shows it largest; 0 if no
-    view shows it. `surfels`: per-surfel parameters, N rows. `extent`: half side, in scale units, of the square that has
-    to meet the image for a view to count. `near`: near plane, camera z."""
+    view shows it: its square of half side `extent`, in scale units, does not meet the image. `near`: camera z."""
     at = (surfels["means"], tangents(surfels["quats"]), surfels["log_scales"].exp())
     return max_projected_extent(*at, cameras, extent, near) / (2.0 * extent)
 
 
 def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) -> Tensor:
     """Compute how many cells [n, 2] along u and v a pixel of the closest view covers, for tiles `rows` with a grid of
-    `size` (u, v) each: at least 1, at most the side of the grid; 1 if the view is unknown."""
+    `size` (u, v) each, from 1 to the side of the grid; 1 if the view is unknown."""
     extent = shown.extent[rows]
     sides = torch.tensor(size, dtype=torch.float32, device=extent.device).expand(len(extent), 2)
     if shown.pixels is None:
@@ -79,8 +72,8 @@ def moving_average(values: Tensor, cells: Tensor) -> Tensor:
 
 
 def _windows(count: int, width: Tensor) -> Tensor:
-    """Build matrices [n, count, count] of a moving average: row i has every cell's share of the window about cell i,
-    for windows of `width` [n] cells."""
+    """Build matrices [n, count, count] of a moving average with windows of `width` [n] cells: every cell's part of
+    them."""
     edge, half = torch.arange(count, device=width.device, dtype=torch.float32), width[:, None] / 2
     center = torch.minimum(torch.maximum(edge + 0.5, half), count - half)  # [n, count]
     low, high = (center - half)[:, :, None], (center + half)[:, :, None]
@@ -89,9 +82,8 @@ def _windows(count: int, width: Tensor) -> Tensor:
 
 @torch.no_grad()
 def certified(baked: Coded, cameras: Sequence[Camera]) -> Coded:
-    """Certify a bake: measure the error of the stored residual colours against those before quantisation, as training
-    views see it, and state it in the statistics; alphas are not covered. A bake without texels, or without a tolerance,
-    is returned as it is."""
+    """State the error of the stored residual colours against those before quantisation, as training views see it, in
+    the statistics; alphas are not covered. A bake without texels, or without a tolerance, is returned as it is."""
     scene, options = baked.scene, baked.options
     if baked.atlas is None or options.tolerance == 0:
         return baked

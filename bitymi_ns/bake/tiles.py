@@ -43,9 +43,8 @@ class TileVisibility:
 
 
 def texel_centers(count: int, extent: Tensor) -> Tensor:
-    """Compute surfel coordinates [..., count] of the centres of `count` texels along one axis: (i + 0.5) / count * 2
-    extent - extent, in the dtype of the extents. `extent`: [..., 1] half sides of tiles in scale units (e; 3 covers
-    exactly the support)."""
+    """Compute surfel coordinates [..., count] of the centres of `count` texels along one axis, in scale units and the
+    dtype of the half sides `extent` [..., 1]: (i + 0.5) / count * 2 extent - extent."""
     return extent * ((2.0 * torch.arange(count, device=extent.device) + 1.0) / count - 1.0)
 
 
@@ -79,10 +78,8 @@ _FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a 
 
 @lru_cache(maxsize=64)
 def interpolation(probes: int, texels: int) -> Tensor:
-    """Build the matrix [probes, texels] float32 from a tile's texels to evenly spaced probes along one axis.
-
-    Linear between texel centres and constant beyond the outer ones, as the renderers fetch them.
-    """
+    """Build the matrix [probes, texels] float32 from a tile's texels to evenly spaced probes along one axis: linear
+    between texel centres and constant beyond the outer ones, as the renderers fetch them."""
     x = ((torch.arange(probes, dtype=torch.float64) + 0.5) * texels / probes - 0.5).clamp(0, texels - 1)
     low = x.floor().long().clamp(max=max(texels - 2, 0))
     matrix = torch.zeros(probes, texels, dtype=torch.float64)
@@ -152,11 +149,9 @@ def _constant(values: Tensor, weight: Tensor, tolerance: float) -> tuple[Tensor,
 
 
 def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
-    """Find the smallest grid within the tolerance for each tile [n, C, v, u]: pairs of size and rows.
-
-    The root of the summed squares of the errors of coarsening along u alone and along v alone predicts that of both.
-    Only grids whose prediction is near the tolerance or below are tried.
-    """
+    """Find the smallest grid within the tolerance for each tile [n, C, v, u]: pairs of size and rows. The root of the
+    summed squares of the errors of coarsening along u alone and along v alone predicts that of both; only grids whose
+    prediction is near the tolerance or below are tried."""
     count, limit_v, limit_u = len(values), *values.shape[2:]
     limits = (limit_u, limit_v)
     sides_u, sides_v = ([r for r in (r_min << i for i in range(16)) if r < side] + [side] for side in limits)

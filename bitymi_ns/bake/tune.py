@@ -33,8 +33,6 @@ F = TypeVar("F", EncodedAtlas, TexelCodes)
 
 @dataclass(frozen=True)
 class StoredTexels(Generic[F]):
-    """Texels as they are stored."""
-
     listed: Tensor  # [T, 3] what was coded
     texels: Tensor  # [T, 3] as they are drawn
     stored: F
@@ -64,7 +62,6 @@ class Cosines:
         return self._coded(texels, self._coder.fit(texels, self._most * TO_START))
 
     def again(self, texels: Tensor) -> StoredTexels[TexelCodes]:
-        """Code texels between steps, quickly."""
         codes = self._coder.code(texels, rounds=0)
         if self._fill and self._most is not None:
             self._coder.aim(codes, self._most * TO_FILL)
@@ -102,7 +99,6 @@ class Pages:
         return StoredTexels(texels.clone(), drawn, atlas)
 
     def last(self, best: StoredTexels[EncodedAtlas]) -> StoredTexels[EncodedAtlas]:
-        """Return the best atlas as it is, see `Cosines.last`."""
         return best
 
 
@@ -157,19 +153,15 @@ def tune_atlas(
     validation views best are kept, or the baked ones if none are better.
 
     Args:
-        baked: a bake with tiles, which keep their sizes; constants of surfels without a tile are tuned, too. Where its
-            surfels are rounded for a compact bundle, the last steps see what its coding makes of the texels, and the
-            codes that show the validation views best are kept.
-        views: training views, with the corrections that training found; every `val_every`-th is for validation.
+        baked: with tiles, which keep their sizes; constants of surfels without a tile are tuned, too. The last steps
+            see what its coding makes of the texels.
+        views: training views, with the corrections that training found, on any device; every `val_every`-th is for
+            validation.
         background: [3] colour behind the scene.
         eval_views: held-out views on which the gain of the stored texels is measured; they decide nothing.
 
-    Photographs and cameras may be on another device than the work: each view is copied when it is traced.
-
-    Returns:
-        the bake with coded texels and `statistics.finetune`; the texels stay as they are if there are fewer than
-        `FEWEST_VIEWS` views (without validation, none).
-    """
+    Returns the bake with coded texels and `statistics.finetune`; the texels stay as they are if there are fewer than
+    `FEWEST_VIEWS` views (without validation, none)."""
     options = options or TuneOptions()
     options.check()
     if len(views) < (FEWEST_VIEWS if options.val_every else 1):
@@ -185,18 +177,18 @@ def tune_atlas(
         covered, coder = baked.coverage.to(baked.device), Cosines(baked, baked.coverage[:, 1])
     else:
         covered, coder = texels.coverage(trained, progress), Pages(baked)
-    share = 1.0 / (covered[:, 0] + options.prior)  # [T]
+    step_size = 1.0 / (covered[:, 0] + options.prior)  # [T]
     moved = texels.values.clone()
     for step in range(options.steps):
         view, rate = training_order(len(tuned), options.seed, step), falling(options.rate, step, options.steps)
-        tuned.step(view, moved, share, rate, options.ssim_weight)
+        tuned.step(view, moved, step_size, rate, options.ssim_weight)
         progress("tuning texels", step + 1, options.steps)
         if stopping.due(step + 1) and not stopping.update(step + 1, validation.psnr(moved), moved.clone):
             progress("tuning texels", step + 1, step + 1)  # completes the bar
             break
     held_out = TuningViews(texels, eval_views, background, MemoryBudget(0))
     untuned = held_out.psnr(coder.first(texels.values.cpu()).texels) if eval_views else None
-    coded = _coded(tuned, validation, share, stopping.best, coder, options, progress)
+    coded = _coded(tuned, validation, step_size, stopping.best, coder, options, progress)
     spent = time.perf_counter() - started, time.process_time() - cpu_started
     statistics = stopping.statistics(len(tuned), len(validation), *spent).replace(
         steps=stopping.done + options.coded_steps,
@@ -209,14 +201,14 @@ def tune_atlas(
 def _coded(
     views: TuningViews,
     validation: TuningViews,
-    share: Tensor,
+    step_size: Tensor,
     texels: Tensor,
     coding: TexelCoding,
     options: TuneOptions,
     progress: Progress,
 ) -> StoredTexels:
     """Optimise texels [T, 3] through their coding: the image is that of the stored texels, and its gradient moves the
-    uncoded ones. Return the coded texels that show the validation views best."""
+    uncoded."""
     coded = coding.first(texels.cpu())
     texels = coded.texels.to(texels.device, copy=True)
     psnr = validation.psnr(texels, progress)
@@ -225,7 +217,7 @@ def _coded(
     for step in range(options.coded_steps):
         view = training_order(len(views), options.seed, step)
         rate = falling(options.coded_rate, step, options.coded_steps)
-        views.step(view, texels, share, rate, options.ssim_weight, texels + shift)
+        views.step(view, texels, step_size, rate, options.ssim_weight, texels + shift)
         progress("tuning texels as they are stored", step + 1, options.coded_steps)
         last = step + 1 == options.coded_steps
         if (step + 1) % options.coded_every == 0 or last:

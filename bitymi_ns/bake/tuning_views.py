@@ -28,14 +28,8 @@ from bitymi_ns.train.views import MemoryBudget, View, shown
 
 
 class TexelList:
-    """The texels of a bake, tile after tile. A surfel without a tile has one texel, its constant residual.
-
-    Attributes:
-        scene: the surfels, on the device.
-        tiles: where the texels lie.
-        values: [T, 3] residual colours as baked, on the device.
-        alpha: opacities of the texels on the device, which are not tuned; None = opaque texels.
-    """
+    """The texels of a bake on its device, tile after tile: [T, 3] residual colours as baked (`values`), and alphas,
+    which are not tuned (None = opaque). A surfel without a tile has one texel, its constant residual."""
 
     def __init__(self, baked: Stage) -> None:
         """Raises ValueError: no surfel has a tile."""
@@ -48,7 +42,6 @@ class TexelList:
         self.alpha = None if baked.alpha is None else baked.alpha.to(device)
 
     def projection(self, camera: Camera) -> Projection:
-        """Project the surfels into a view."""
         geometry = geometry_of(self.scene.surfels)
         return project(*geometry, camera=camera.to(self.device), near=self.scene.near, alpha=self.alpha)
 
@@ -82,7 +75,6 @@ class TuningView:
 
     @property
     def nbytes(self) -> int:
-        """Count the bytes in memory."""
         arrays = (self.base, self.rest, self.target, self.mask, self.alpha, *self.lists)
         return sum(array.nbytes for array in arrays if array is not None)
 
@@ -141,29 +133,28 @@ class TuningViews(Sequence[TuningView]):
         )
 
     def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
-        """Render a view with texels, and apply its photograph's correction: [H, W, 3]. `view`: of this sequence.
-        `texels`: [T, 3], as the baked renderer shows them before any quantisation."""
+        """Render a view of this sequence with texels [T, 3], not quantised, and its photograph's correction: [H, W,
+        3]."""
         drawn = (view.projection, view.base, texels, self._texels.tiles)
         rgb = torch.cat([blended_image(part, *drawn, descent=descent)[:, :3] for part in view.lists])
         rgb = rgb.view_as(view.rest) + view.rest
         return rgb if view.alpha is None else shown(rgb, view.correction, view.alpha, self._background)
 
     def step(
-        self, index: int, texels: Tensor, share: Tensor, rate: float, ssim_weight: float, read: Tensor | None = None
+        self, index: int, texels: Tensor, step_size: Tensor, rate: float, ssim_weight: float, read: Tensor | None = None
     ) -> None:
-        """Take a gradient step on texels with a view's loss, summed over pixels and channels instead of averaged: move
-        `texels` [T, 3] in place, texel t by -rate share[t] times its gradient, with `share` [T]. `ssim_weight`: share
-        of 1 - SSIM in the loss. `read`: [T, 3] texels that the picture shows; None = those that are moved."""
+        """Take a gradient step on `texels` [T, 3] in place with a view's loss, summed over pixels and channels instead
+        of averaged: texel t moves by -rate step_size[t] times its gradient. `read`: [T, 3] texels that the picture
+        shows; None = those that are moved."""
         view = self[index]
         if read is None:
             read = texels if len(view.lists) == 1 else texels.clone()  # a band must not read what another has moved
         # the loss is a mean, the step wants a sum
-        descent = TexelDescent(share, rate * count_values(view.target, view.mask), texels)
+        descent = TexelDescent(step_size, rate * count_values(view.target, view.mask), texels)
         photometric(self.picture(view, read, descent), view.target, ssim_weight, view.mask).backward()
 
     @torch.no_grad()
     def psnr(self, texels: Tensor, progress: Progress = no_progress) -> float:
-        """Average the PSNR, dB, over views with an unmasked pixel."""
         texels = texels.to(self._texels.device)
         pictures = ((self.picture(view, texels), view.target, view.mask) for view in self)
         return evaluate(pictures, len(self), progress)

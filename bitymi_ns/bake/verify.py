@@ -18,9 +18,8 @@ _SLACK = 1.02  # largest ratio to the stated error: sums in another order, rotat
 
 
 def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
-    """Measure lean view colours against the trained ones, and compare with the error that bundle.json states. `bundle`:
-    what `check_files` read. `surfels`: per-surfel parameters of the scene that was baked; `_keys` match them to the
-    bundle's. `cameras`: its training views."""
+    """Measure lean view colours against those of `surfels`, the scene that was baked, matched by `_keys`, and compare
+    with the error that bundle.json states. `cameras`: its training views."""
     name = "error of the view colours"
     if "view_terms" not in bundle.scene.surfels:
         return Check(name, True, "none: all of them are kept")

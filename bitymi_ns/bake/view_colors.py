@@ -67,8 +67,8 @@ def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
 
 
 def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Tensor:
-    """Evaluate the blended colour max(f_view + 0.5, 0) by the renderers' kernels: [n, D, 3]. `kind`: a name of
-    `ops.VIEW_COLORS`. `params`: parameters of n surfels, all or lean. `directions`: [n, D, 3] unit vectors."""
+    """Evaluate the blended colour max(f_view + 0.5, 0) of n surfels, all or lean, by the renderers' kernels: [n, D, 3]
+    in directions [n, D, 3], unit vectors."""
     origin = directions.new_zeros(3)
     columns = [view_color(kind, params, d.contiguous(), origin) for d in directions.unbind(1)]
     return view_base(torch.stack(columns, dim=1))
@@ -91,13 +91,13 @@ def color_choices(
     near: float = 0.0,
     progress: Progress = no_progress,
 ) -> ColorChoices:
-    """Fit view colours of fewer terms, from one colour up to the fewest terms within a tolerance.
+    """Fit view colours of fewer terms, from one colour up to the fewest terms within a tolerance; returned on the CPU.
 
-    The tolerance bounds the largest error over all directions of `view_directions` and the channels, of
-    max(f_view + 0.5, 0), times the largest blending weight that the surfel can have. One colour is tried first, the
-    middle between the extremes; then 2, 3, ... sites: those that are hardest to do without, fitted together by least
-    squares. A surfel for which none is good enough keeps all sites. Surfels of a kind without sites (`ViewColor.sites`)
-    keep one colour, or all terms.
+    The tolerance bounds the largest error over all directions of `view_directions` and the channels, of max(f_view +
+    0.5, 0), times the largest blending weight that the surfel can have. One colour is tried first, the middle between
+    the extremes; then 2, 3, ... sites: those that are hardest to do without, fitted together by least squares. A surfel
+    for which none is good enough keeps all sites. Surfels of a kind without sites (`ViewColor.sites`) keep one colour,
+    or all terms.
 
     Colours of fewer terms are choices, too, each with its squared error in the pictures, weighted by what the views
     show of the surfel (`squares`): half of the weight lies on the directions of the training views, half on directions
@@ -106,16 +106,11 @@ def color_choices(
 
     Args:
         surfels: per-surfel parameters, N rows; their device does the work.
-        kind: a name of `ops.VIEW_COLORS`.
         squares: [V, N] what the training views show of each surfel (`Visibility.squares`); V may be 0.
         centers: [V, 3] float64 camera centres.
         opacity: [N] largest blending weight.
         tolerance: 8-bit steps.
-        near: near plane; views count as at least that far from a surfel.
-
-    Returns:
-        on the CPU.
-    """
+        near: near plane; views count as at least that far from a surfel."""
     means, entry = surfels["means"], VIEW_COLORS[kind]
     most = entry.terms(surfels) - entry.base_terms
     error = means.new_full((len(means), most + 1), torch.inf)
@@ -187,8 +182,8 @@ def _unseen(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tup
 
 
 def _one_color(target: Tensor, valid: Tensor, weight: Tensor, allowed: Tensor) -> Tensor:
-    """Choose the middle [n, 3] of the extremes of colours [n, D, 3] if it is within `allowed` [n] 8-bit steps, else
-    their mean."""
+    """Choose the middle [n, 3] of the extremes of colours [n, D, 3] if within `allowed` [n] 8-bit steps, else their
+    mean."""
     low = target.masked_fill(~valid[..., None], torch.inf).amin(1)
     high = target.masked_fill(~valid[..., None], -torch.inf).amax(1)
     weight = weight + LEAST_WEIGHT
@@ -207,13 +202,8 @@ def view_color_errors(
     opacity: Tensor,
 ) -> Tensor:
     """Measure the largest error of every surfel's view colour over the directions of `view_directions`, times its
-    largest blending weight, in 8-bit steps: [N].
-
-    Args:
-        full, lean: parameters of N surfels as they were trained, and their lean ones.
-        seen: [V, N] bool, the training views that see each surfel; V may be 0.
-        kind, centers, opacity: as in `color_choices`.
-    """
+    largest blending weight, in 8-bit steps: [N]. `full`, `lean`: parameters as trained, and lean ones. `seen`: [V, N]
+    bool, the training views that see each surfel; V may be 0. `centers`, `opacity`: as in `color_choices`."""
     error = means.new_zeros(len(means))
     for at in view_directions(means, seen, centers):
         exact = shown_at(kind, {name: full[name][at.rows] for name in VIEW_COLORS[kind].names}, at.unit)
@@ -226,8 +216,8 @@ def view_color_errors(
 def reduce_view_colors(
     inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
 ) -> tuple[dict[str, Tensor], ColorChoices | None, ViewColorError | None]:
-    """Reduce the view colours within the tolerance. Return the surfels with lean view colours, the choices of fewer
-    terms and the error; a tolerance of 0 keeps all terms."""
+    """Reduce the view colours within the tolerance; 0 keeps all terms. Returns surfels, the choices of fewer terms and
+    the error."""
     surfels, tolerance = dict(inputs.surfels), options.tolerance
     if tolerance == 0:
         return surfels, None, None

@@ -67,8 +67,7 @@ class BakeOptions:
         return "uint8" if self.bundle_format == "compact" else self.bundle_format
 
     def check(self) -> None:
-        """Check the values. Raises ValueError: an option is out of its range. Raises RuntimeError: the BC7 encoder is
-        not installed."""
+        """Raise ValueError: an option is out of its range; RuntimeError: the BC7 encoder is not installed."""
         if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
             raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")
         if not 0 <= self.tolerance < STEPS:

@@ -27,17 +27,11 @@ def _gains_or_rows(numbers: list[float]) -> list[float]:
 
 
 class CapturedCamera(BaseModel):
-    """A camera of the capture.
+    """A camera of the capture, and its photograph: size, focal lengths and principal point in pixels.
 
-    Attributes:
-        name: name of its photograph.
-        held_out: whether training left the photograph out.
-        width, height, fx, fy, cx, cy: of the photograph, in pixels.
-        viewmat: [16] world to camera by rows, OpenCV axes.
-        photograph: file of the bundle with the photograph, possibly reduced; None if it has none.
-        correction: maps colours of the scene, but not the background, to the photograph's: 3 gains, or 12 numbers,
-            matrix and offset [3, 4] by rows; None: mean exposure.
-    """
+    `viewmat`: [16] world to camera by rows, OpenCV axes. `photograph`: file of the bundle, possibly reduced.
+    `correction`: maps colours of the scene, but not the background, to the photograph's: 3 gains, or 12 numbers, matrix
+    and offset [3, 4] by rows; None: mean exposure."""
 
     name: str
     held_out: bool
@@ -55,7 +49,6 @@ class CapturedCamera(BaseModel):
     def of(
         cls, name: str, camera: Camera, held_out: bool, photograph: str | None = None, correction: Tensor | None = None
     ) -> "CapturedCamera":
-        """Describe a camera."""
         (fx, _, cx), (_, fy, cy), _ = camera.K.cpu().tolist()
         size = {"width": camera.width, "height": camera.height}
         viewmat = camera.viewmat.cpu().flatten().tolist()
@@ -73,13 +66,11 @@ class CapturedCamera(BaseModel):
 
     @property
     def camera(self) -> Camera:
-        """Convert to a camera on the CPU."""
         K = torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float32)
         return Camera(torch.tensor(self.viewmat, dtype=torch.float32).view(4, 4), K, self.width, self.height)
 
 
 def cameras_data(cameras: Iterable[CapturedCamera]) -> bytes:
-    """Serialise cameras.json."""
     rows = [camera.model_dump(exclude_none=True) for camera in cameras]
     return (json.dumps({"cameras": rows}) + "\n").encode()
 

@@ -35,8 +35,8 @@ MOST_COEFFICIENT = 1 << 24
 def encode_surfels(
     codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None, digest: Digest
 ) -> tuple[dict[str, Any], bytes]:
-    """Encode surfels.bin; returns its entries in bundle.json and its bytes. `residual`: [N, 3] mean residuals: green,
-    red - green, blue - green. `residual_step`: their step. `alpha`: [N] mean alphas, 128 = 1; None if opaque."""
+    """Encode surfels.bin; returns its entries in bundle.json and its bytes. `residual`: [N, 3] mean residuals in steps:
+    green, red - green, blue - green. `alpha`: [N] mean alphas, 128 = 1; None if opaque."""
     columns = {**codes.columns, "residual": residual}
     if alpha is not None:
         columns["alpha"] = alpha[:, None]
@@ -93,7 +93,6 @@ def decoded_hash(info: Manifest, files: Mapping[str, bytes | bytearray]) -> str:
 def _compressed(
     columns: Mapping[str, npt.NDArray[np.integer]], steps: Mapping[str, float], digest: Digest
 ) -> tuple[list[dict[str, Any]], bytes]:
-    """Compress columns; returns their entries in bundle.json and the bytes."""
     for values in columns.values():
         digest.update(np.ascontiguousarray(values, "<i8").data)
     found = {name: streams.compress(values) for name, values in columns.items()}
@@ -117,16 +116,8 @@ def decode_texels(
     alpha: Codes | None = None,
     digest: Digest | None = None,
 ) -> TexelCodes:
-    """Decode texels.bin.
-
-    Args:
-        sizes: [N, 2] tile sides.
-        residual, residual_step: from surfels.bin.
-        alpha: from surfels.bin; None if opaque.
-
-    Raises:
-        StreamError: the file is damaged or contradicts bundle.json or the tile sizes.
-    """
+    """Decode texels.bin, with tile sides [N, 2] and residuals, their step and mean alphas (None if opaque) from
+    surfels.bin. Raises StreamError: the file is damaged or contradicts bundle.json or the tile sizes."""
     assert info.columns is not None and info.step is not None and info.texels is not None
     count = int(sizes.prod(dim=1).sum())
     if count != info.texels:
@@ -156,8 +147,8 @@ def decode_texels(
 
 
 def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
-    """Compute the layout of the tiles in pages, which follows from their sizes. Raises StreamError: the pages differ
-    from those in bundle.json."""
+    """Lay out the tiles in pages, which follows from their sizes. Raises StreamError: the pages differ from
+    bundle.json's."""
     try:
         packing = pack(sizes.numpy(), info.page_width or 0, info.page_rows or 0)
     except ValueError as error:

@@ -79,9 +79,8 @@ def descriptor(format: Format) -> bytes:
 def write_ktx2(
     path: str | Path, payload: Sequence[bytes], format: Format, width: int, height: int, writer: str
 ) -> None:
-    """Write a 2D array texture with one level, without supercompression. `payload`: one bytes object per layer, rows
-    from the top. `format`: bc7, uint8 (RGBA) or fp16 (RGBA). `width`, `height`: in texels; multiples of 4 for bc7.
-    `writer`: name and version of the program (KTXwriter)."""
+    """Write a 2D array texture with one level, without supercompression. `payload`: a layer each, rows from the top.
+    `width`, `height`: in texels; multiples of 4 for bc7. `writer`: name and version of the program (KTXwriter)."""
     layout = _LAYOUTS[format]
     expected = layer_bytes(format, width, height)
     if not payload or any(len(layer) != expected for layer in payload):
@@ -139,8 +138,8 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
 
 
 def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
-    """Parse and check a file written by `write_ktx2`, without copying the texels. Raises Ktx2Error: another kind of
-    file, truncated, or contradictory."""
+    """Parse a file written by `write_ktx2`, without copying the texels. Raises Ktx2Error: as `read_header`, or
+    truncated."""
     view = memoryview(data)
     header = read_header(view, len(view))
     size = layer_bytes(header.format, header.width, header.height)

@@ -40,8 +40,7 @@ class BundleError(ValueError):
 
 
 def check_file_name(name: str, source: str) -> None:
-    """Check that a name is a plain file name, so that no bundle reaches out of its folder. Raises BundleError: it is
-    not; names `source`."""
+    """Raise BundleError of `source` unless a name is a plain file name, so that no bundle reaches out of its folder."""
     if not _is_file_name(name):
         raise BundleError(f"{source}: {short(name)} cannot be the name of a file of the bundle")
 
@@ -67,8 +66,7 @@ def points_text(points: Tensor) -> str:
 
 
 def points_of(text: str) -> Tensor:
-    """Decode the points [P, 4] float32 of `points_text`. Raises PydanticCustomError: malformed, or a number is out of
-    range."""
+    """Decode the points [P, 4] float32 of `points_text`. Raises PydanticCustomError: malformed, or out of range."""
     try:
         data = base64.b64decode(text, validate=True)
     except (binascii.Error, ValueError) as error:
@@ -208,8 +206,6 @@ class Bounds(Part):
 
 
 class FileEntry(Part):
-    """Size and hash of a file."""
-
     bytes: Annotated[int, Field(ge=0, le=1 << 36)]
     sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
@@ -279,8 +275,8 @@ def dump(manifest: Manifest) -> bytes:
 
 def parse(data: bytes, source: str = MANIFEST) -> Manifest:
     """Parse bundle.json and check everything that readers rely on; unknown keys are kept and ignored. Raises
-    BundleError: not a bundle, a newer major version, a value missing or out of range, or a digest that does not match
-    the contents."""
+    BundleError: not a bundle, too new, a value missing or out of range, or a digest that does not match the
+    contents."""
     try:
         info = strict_json.loads(data)
         if not isinstance(info, dict) or info.get("format") != FORMAT:

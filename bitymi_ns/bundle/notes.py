@@ -78,8 +78,6 @@ class SavedView(_Strict):
 
 
 class Note(_Strict):
-    """Plain text at a position in the scene frame."""
-
     text: Annotated[str, Field(min_length=1, max_length=LONGEST_TEXT), AfterValidator(_printable)]
     position: _Vector
 
@@ -134,7 +132,6 @@ class Notes(_Strict):
 
     @property
     def contents(self) -> str:
-        """Summary for messages."""
         text = f"{len(self.views)} views, {len(self.notes)} notes"
         text += f", {len(self.measures)} measures" if self.measures else ""
         text += ", a crop" if self.crop is not None else ""
@@ -142,7 +139,6 @@ class Notes(_Strict):
 
     @property
     def cropping(self) -> Crop:
-        """Surfels to hide."""
         box, floor = (None, None) if self.crop is None else (self.crop.box, self.crop.floor)
         plane = None if floor is None else (vector(floor.normal), floor.offset)
         return Crop(None if box is None else _box(box), plane, tuple(map(_box, self.hidden)))
@@ -186,8 +182,8 @@ def _refusal(source: str, what: str) -> NotesError:
 
 
 def read_notes(parts: Parts) -> tuple[bytes, Notes] | None:
-    """Read and check a bundle's notes.json: bytes and contents; None if it has none. Raises BundleError: unreadable,
-    too large, or an entry is refused."""
+    """Read and check a bundle's notes.json: bytes and contents; None if it has none. Raises BundleError: it is
+    refused."""
     data = notes_data(parts)
     return None if data is None else (data, parse_notes(data, str(parts.bundle / NOTES)))
 
@@ -206,8 +202,7 @@ def hides(bundle: str | Path) -> bool:
 
 
 def notes_of(bundle: str | Path) -> bytes | None:
-    """Read a bundle's notes.json for copying; links out of the folder are refused. Raises BundleError: as
-    `read_notes`."""
+    """Read a bundle's notes.json for copying, but no link out of the folder. Raises BundleError: as `read_notes`."""
     with parts_of(bundle, inside=True) as parts:
         found = read_notes(parts)
     return None if found is None else found[0]

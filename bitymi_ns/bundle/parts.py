@@ -63,8 +63,8 @@ def public_manifest(info: Manifest, data: bytes) -> bytes:
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a file of a bundle for reading with `safe_reading.open_regular`. Raises BundleError: missing, not a regular
-    file, or the system refuses it."""
+    """Open a file of a bundle as `safe_reading.open_regular` does. Raises BundleError: missing, or it cannot be
+    read."""
     try:
         return safe_reading.open_regular(path)
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -122,8 +122,7 @@ class Parts:
         return size
 
     def read(self, name: str, most: int) -> bytes:
-        """Read a file of at most `most` bytes; the size is checked first. Raises BundleError: missing, larger, or
-        unreadable."""
+        """Read a file of at most `most` bytes. Raises BundleError: missing, larger, or unreadable."""
         with self.opened(name) as (file, size):
             if size > most:
                 raise BundleError(f"{self.bundle / name} has {size} bytes, at most {most} are read")
@@ -190,8 +189,7 @@ def _read_directory(file: BufferedReader) -> tuple[dict[str, _Entry], int]:
 
 
 def notes_data(parts: Parts) -> bytes | None:
-    """Read notes.json, unchecked; None if there is none. Raises BundleError: unreadable, or more than `NOTES_LIMIT`
-    bytes."""
+    """Read notes.json, unchecked; None if there is none. Raises BundleError: unreadable, or too large."""
     try:
         return parts.read(NOTES, NOTES_LIMIT)
     except MissingPart:

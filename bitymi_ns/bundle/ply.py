@@ -17,9 +17,8 @@ def write_ply(
     comments: Sequence[str] = (),
     more: Mapping[str, Mapping[str, npt.NDArray]] | None = None,
 ) -> None:
-    """Write columns as properties of `vertex`, in order. `columns`: name to [N] array; integer columns become `int`,
-    the others `float`. `comments`: header comments, one line each. `more`: columns of further elements by name, in
-    order."""
+    """Write columns [N] as properties of `vertex`, in order: integers as `int`, others as `float`. `comments`: lines of
+    the header. `more`: columns of further elements by name, in order."""
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     body = []
     for element, properties in {"vertex": columns, **(more or {})}.items():

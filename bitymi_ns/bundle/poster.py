@@ -33,10 +33,8 @@ def most_bytes(scene: int) -> int:
 
 
 def encode_poster(pixels: Pixels, most: int) -> bytes | None:
-    """Encode a picture [H, W, 3] as lossy WebP of at most `most` bytes: best quality that fits, else fewer pixels.
-
-    Returns None if nothing fits or this Pillow cannot write WebP: posters are optional.
-    """
+    """Encode a picture [H, W, 3] as lossy WebP of at most `most` bytes: best quality that fits, else fewer pixels. None
+    if nothing fits or this Pillow cannot write WebP: posters are optional."""
     if not features.check("webp"):
         return None
     image = Image.fromarray(pixels)

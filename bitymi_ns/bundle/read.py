@@ -54,13 +54,8 @@ _CHUNK = 1 << 22
 
 @dataclass
 class Bundle:
-    """A loaded bundle.
-
-    Attributes:
-        scene: the baked scene on the CPU; view colours may be lean (`ops.view_color.LEAN`).
-        info: bundle.json.
-        cameras: cameras of the capture, training and held out (`CapturedCamera.camera`); empty without cameras.json.
-    """
+    """A loaded bundle: its scene on the CPU, whose view colours may be lean (`ops.view_color.LEAN`), bundle.json, and
+    the cameras of the capture, training and held out; empty without cameras.json."""
 
     scene: BakedScene
     info: Manifest
@@ -76,17 +71,10 @@ class Bundle:
         return f"{count - len(self):,} of {count:,} surfels are hidden by {NOTES}" if len(self) < count else ""
 
     def to(self, device: torch.device | str) -> Bundle:
-        """Move the scene to a device."""
         return replace(self, scene=self.scene.to(device))
 
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Render a view over the bundle's background; see `BakedScene.render`.
-
-        Args:
-            camera: the view, on the scene's device.
-            background: [3] colour behind the scene; None: the bundle's own.
-            maps: also beta, depth, normals and overdraw.
-        """
+        """Render a view as `BakedScene.render`, over a background [3]; None: the bundle's own."""
         if background is None:
             background = torch.tensor(self.info.render.background, device=self.scene.tiles.device, dtype=torch.float32)
         return self.scene.render(camera, background, maps)
@@ -102,11 +90,9 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, cr
             encodes large compact atlases (`LARGE_ATLAS`) to BC7, because they have no blocks.
         crop: leave out the surfels that notes.json hides.
 
-    Raises:
-        BundleError: a file of the scene is missing, truncated, altered or malformed, a value is out of range, the
-            version is too new, or memory is insufficient. Other files are left out then, with a warning.
-        NotesError: `crop`, and notes.json is refused or hides no surfels, or all.
-    """
+    Raises BundleError: a file of the scene is missing, truncated, altered or malformed, a value is out of range, the
+    version is too new, or memory is insufficient. Other files are left out then, with a warning. Raises NotesError:
+    `crop`, and notes.json is refused or hides no surfels, or all."""
     with parts_of(folder) as parts:
         info = manifest_of(parts)
         with enough_memory(parts.bundle, info):
@@ -133,8 +119,8 @@ def _cropped(bundle: Bundle, parts: Parts) -> Bundle:
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """Read bundle.json of a folder or single file, checked as far as possible without the other files. Raises
-    BundleError: missing, malformed or altered, or a value is out of range."""
+    """Read bundle.json of a folder or single file. Raises BundleError: missing, malformed or altered, or out of
+    range."""
     with parts_of(folder) as parts:
         return manifest_of(parts)
 
@@ -147,7 +133,6 @@ def read_cameras(folder: str | Path) -> list[CapturedCamera]:
 
 
 def manifest_of(parts: Parts) -> Manifest:
-    """Read bundle.json of an open bundle."""
     try:
         data = parts.read(MANIFEST, MANIFEST_LIMIT)
     except MissingPart as error:
@@ -164,17 +149,10 @@ def download_bytes(folder: Path, info: Manifest) -> int:
 
 
 def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep: bool = True) -> bytearray:
-    """Read a file listed in bundle.json.
-
-    Args:
-        name: one of `info.files`.
-        verify: compare it with its SHA-256 while reading.
-        keep: False: only check it and return no bytes.
-
-    Raises:
-        BundleError: the file is missing, its size or hash differs, its header contradicts its size or bundle.json, or
-            its contents exceed this machine's memory. All but the hash is checked before the file is read.
-    """
+    """Read a file listed in bundle.json. `verify`: compare it with its SHA-256 while reading. `keep`: False: only check
+    it and return no bytes. Raises BundleError: the file is missing, its size or hash differs, its header contradicts
+    its size or bundle.json, or its contents exceed this machine's memory. All but the hash is checked before the file
+    is read."""
     path, entry = parts.bundle / name, info.files[name]
     with parts.opened(name) as (file, size):
         if size != entry.bytes:
@@ -197,8 +175,8 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
 
 
 def _read_whole(file: BufferedReader, head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
-    """Read a file of `size` bytes, of which `head` is read already, and feed them to `sha256`; return them if `keep`,
-    else nothing."""
+    """Read a file of `size` bytes, of which `head` is read already, and feed them to `sha256`; return them if
+    `keep`."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
     view = memoryview(data)
     view[:at] = head
@@ -216,8 +194,8 @@ def _read_whole(file: BufferedReader, head: bytes, size: int, keep: bool, path: 
 
 
 def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True) -> Bundle:
-    """Assemble a bundle from the results of `read_file`. `files`: contents of the files of surfels, texels and cameras,
-    by name. Raises BundleError: malformed, or a value is out of range."""
+    """Assemble a bundle from the results of `read_file`, by name. Raises BundleError: malformed, or a value is out of
+    range."""
     render, atlas, points = info.render, info.atlas, info.render.photographed
     contents = _compact_contents if info.surfels.file == COMPACT_SURFELS else _ply_contents
     scene = BakedScene(

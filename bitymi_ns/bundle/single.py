@@ -78,20 +78,10 @@ def joined(bundle: str | Path) -> tuple[bytes, SingleFile]:
 
 
 def write_folder(bundle: str | Path, folder: Path, beside: Mapping[str, bytes]) -> list[str]:
-    """Write the files of a bundle to a folder, atomically.
-
-    Args:
-        bundle: single file or folder.
-        folder: missing or empty.
-        beside: further files by name, not covered by bundle.json.
-
-    Returns:
-        files listed in bundle.json that are not of the format and were not written.
-
-    Raises:
-        BundleError: no bundle, a file is missing or altered, memory is insufficient, or the folder is occupied.
-        OSError: it cannot be written.
-    """
+    """Write the files of a bundle, a folder or single file, to a missing or empty folder, atomically. `beside`: further
+    files by name, not covered by bundle.json. Returns the files listed in bundle.json that are not of the format and
+    were not written. Raises BundleError: no bundle, a file is missing or altered, memory is insufficient, or the folder
+    is occupied. Raises OSError: it cannot be written."""
 
     def check() -> None:
         if os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir())):

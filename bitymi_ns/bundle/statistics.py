@@ -92,8 +92,6 @@ class LeftOut(Part):
 
 
 class KeptSurfels(Part):
-    """Numbers of surfels."""
-
     trained: Whole | None = None
     kept: Whole | None = None
     left_out: LeftOut | None = None
@@ -114,8 +112,6 @@ class KeptTexels(Part):
 
 
 class AtlasCost(Part):
-    """Bytes of the atlas and quantisation error."""
-
     bytes: Count | None = None
     pages: tuple[Whole, Whole, Whole] | None = None  # layers, height, width in texels
     occupancy: Share | None = None

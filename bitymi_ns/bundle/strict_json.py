@@ -22,8 +22,8 @@ def loads(data: bytes | bytearray) -> Any:
 
 
 def canonical(value: Any) -> bytes:
-    """Serialise a JSON value canonically: sorted keys, no white space, ASCII. Raises ValueError: a number is not
-    finite, or the value is nested too deeply."""
+    """Serialise JSON: sorted keys, no white space, ASCII. Raises ValueError: a number is not finite, or nested too
+    deeply."""
     try:
         return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode("ascii")
     except RecursionError as error:

@@ -45,11 +45,8 @@ COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> Tensor:
-    """Average f_view over all directions, without the bias 0.5: [N, 3].
-
-    Uses the closed form of the kind (`ViewColor.mean`) if there is one; else, and for lean colours (which need `kind`),
-    a mean over 32 directions. For display only.
-    """
+    """Average f_view over all directions, without the bias 0.5, for display: [N, 3]. By the closed form of the kind
+    (`ViewColor.mean`) if there is one; else, and for lean colours (which need `kind`), as a mean over 32 directions."""
     kind = kind or kind_of(surfels)
     entry = VIEW_COLORS[kind]
     if entry.mean is not None and "view_terms" not in surfels:
@@ -60,9 +57,8 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
 
 
 def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDArray]:
-    """Convert a scene to the columns of surfels.ply, without the terms of lean view colours (`term_columns`). `scene`:
-    N surfels. Mean residuals are included in the colour that other viewers show; residuals and extents get columns if
-    present. `has_alpha`: write mean alphas."""
+    """Convert a scene to the columns of surfels.ply, without the terms of lean view colours (`term_columns`). Mean
+    residuals are included in the colour that other viewers show; residuals and extents get columns if present."""
     kind, surfels, tiles = scene.view_color, scene.surfels, scene.tiles.numpy()
     lean = "view_terms" in surfels
     surfels = {name: _plain(value) for name, value in surfels.items()}
@@ -146,14 +142,9 @@ def from_columns(
         extent: half side of the tiles in scale units if there is no column.
         has_alpha: require mean alphas.
 
-    Returns:
-        fields of `BakedScene`: surfels, float32 per-surfel parameters (unit quaternions); tiles [N, 5] int32; extent
-        [N]; mean_residual [N, 3], 0 without its columns; mean_alpha [N] or None.
-
-    Raises:
-        PlyError: a column is missing or of the wrong type, the view colour has the wrong number of columns, or a value
-            is beyond its limit.
-    """
+    Returns fields of `BakedScene`: surfels, float32 per-surfel parameters (unit quaternions); tiles [N, 5] int32;
+    extent [N]; mean_residual [N, 3], 0 without its columns; mean_alpha [N] or None. Raises PlyError: a column is
+    missing or of the wrong type, the view colour has the wrong number of columns, or a value is beyond its limit."""
     if kind not in VIEW_COLORS:
         raise PlyError(f"the view colour {kind!r} is none of {sorted(VIEW_COLORS)}")
     tiles = _stack(columns, TILE_COLUMNS, np.int32)

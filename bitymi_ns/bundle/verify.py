@@ -20,16 +20,14 @@ SLACK_STEPS = 0.02  # 8-bit steps by which a measured error may exceed the state
 
 @dataclass(frozen=True)
 class Check:
-    """Result of a check: name, outcome, numbers."""
-
     name: str
     ok: bool
     detail: str
 
 
 def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
-    """Check a bundle on its own: sizes and hashes of its files, formats, numbers, tiles. Returns the bundle, None if
-    unreadable, and the checks in order."""
+    """Check a bundle on its own: sizes and hashes of its files, formats, numbers, tiles. Returns it, None if
+    unreadable."""
     try:
         with parts_of(folder) as parts:
             return _check_parts(parts)
@@ -131,7 +129,6 @@ def _count_tiles(tiles: Tensor, atlas: Tensor | None) -> Tensor:
 
 
 def _check_counts(bundle: Bundle) -> Check:
-    """Compare the counts in bundle.json with the files."""
     statistics = bundle.info.statistics
     surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color
     found = {"surfels kept": len(bundle), "texels kept": int(bundle.scene.tiles[:, 3:].long().prod(1).sum())}

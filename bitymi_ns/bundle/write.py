@@ -67,22 +67,15 @@ def write_bundle(
             that other viewers show. Mean alphas are required by, and written with, an atlas with alphas.
         atlas: of the texels, an `EncodedAtlas` where there are no codes; None for a scene without texture.
         codes: codes of surfels and texels, for a compact bundle; scene and atlas must be decoded from them.
-        background: colour behind the surfels.
-        world: frame of the scene.
-        statistics: statistics of the bake (`statistics.Statistics`).
+        statistics: of the bake (`statistics.Statistics`).
         extra_files: further files by name, such as preview.png.
         loose_files: files that may be edited later, not covered by bundle.json.
         overwrite: replace an existing bundle, carrying over its notes.json.
         interchange: also write surfels.ply into a compact bundle, for other programs.
         poster: [H, W, 3] picture of the viewer's first view.
 
-    Returns:
-        the bundle as read.
-
-    Raises:
-        BundleError: the target exists or cannot be written, a parameter is not finite or beyond its limit
-            (`limits.py`, `manifest.py`), or what was written cannot be read.
-    """
+    Returns the bundle as read. Raises BundleError: the target exists or cannot be written, a parameter is not finite or
+    beyond its limit (`limits.py`, `manifest.py`), or what was written cannot be read."""
     folder = Path(folder)
     surfels = scene.surfels
     _check_surfels(scene)

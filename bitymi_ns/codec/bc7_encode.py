@@ -16,9 +16,8 @@ STRIP = 64  # rows per encoder call: enough calls for all threads and for progre
 
 
 def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[np.uint8]], bytes]:
-    """Return a function that encodes RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks in row-major order.
-    Without `alpha`, every alpha byte is 255. Raises RuntimeError: the encoder is not installed. Raises ValueError:
-    unknown profile."""
+    """Return a function that encodes RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks in row-major order;
+    without `alpha` all alphas are 255. Raises RuntimeError: it is not installed. Raises ValueError: unknown profile."""
     try:
         import ispc_texcomp
     except ImportError as error:
@@ -39,8 +38,7 @@ def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[
 
 
 def bc7_blocks(pages: npt.NDArray[np.uint8], profile: Profile, alpha: bool = False) -> npt.NDArray[np.uint8]:
-    """Encode texels [layers, height, width, 4], sides multiples of 4: [layers, height / 4, width / 4, 16] blocks.
-    `alpha`: encode alphas; otherwise all of them are 255. Raises RuntimeError: the encoder is not installed."""
+    """Encode texels [layers, height, width, 4] as `bc7_encoder` does: [layers, height / 4, width / 4, 16] blocks."""
     compress = bc7_encoder(profile, alpha)
     layers, height, width, _ = pages.shape
     strips = [page[top : top + STRIP] for page in pages for top in range(0, height, STRIP)]

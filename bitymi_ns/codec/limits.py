@@ -27,14 +27,13 @@ LIMITS: dict[str, Limit] = {
 
 
 def limit_of(name: str, kind: str) -> Limit:
-    """Return the largest absolute values of a parameter, as in `LIMITS`; infinite if it has no limit. `name`: a surfel
-    parameter, view_terms of lean view colours, or mean_residual. `kind`: a name of `ops.VIEW_COLORS`."""
+    """Return the largest absolute values of a parameter, as in `LIMITS`, of view_terms or mean_residual; else
+    infinite."""
     return VIEW_COLORS[kind].lean_limit if name == "view_terms" else LIMITS.get(name, (float("inf"),))
 
 
 def beyond(name: str, kind: str, values: Tensor) -> Tensor:
-    """Compute the mask of values beyond the limit of their parameter: bool, of the shape of `values`. `name` and
-    `kind`: as in `limit_of`. `values`: [N] or [N, ...]."""
+    """Compute the mask, of the shape of `values` [N] or [N, ...], of values beyond the limit of their parameter."""
     largest = limit_of(name, kind)
     most = torch.tensor(largest, device=values.device, dtype=torch.float32) if values.dim() > 1 else largest[0]
     return values.abs() > most

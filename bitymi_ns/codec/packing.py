@@ -23,7 +23,6 @@ class Packing:
 
     @property
     def texels(self) -> int:
-        """Texels of all tiles."""
         return int(self.tiles[:, 3:].astype(np.int64).prod(axis=1).sum())
 
     @property
@@ -39,15 +38,9 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
     Tiles are sorted by r_v descending, then r_u descending, then index; each goes to the first shelf with room, or
     opens a new shelf of its own height. Sides are powers of two, so the tiles of one size are placed by arithmetic,
     shelf starts are multiples of their height, and page boundaries never cut a shelf. The result is deterministic.
-
-    Args:
-        resolution: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) for a surfel without a tile.
-        page_width: largest page width in texels, a power of two; smaller atlases get narrower pages.
-        max_rows: largest page height; 8192 is the limit of WebGPU and phones.
-
-    Raises:
-        ValueError: sizes are not powers of two or too wide, or more than `max_layers` pages would be needed.
-    """
+    `resolution`: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) for a surfel without a tile. `page_width`: a
+    power of two; smaller atlases get narrower pages. `max_rows`: 8192 is the limit of WebGPU and phones. Raises
+    ValueError: sizes are not powers of two or too wide, or more than `max_layers` pages would be needed."""
     sizes = np.asarray(resolution, dtype=np.int64).reshape(-1, 2)
     _check_sizes(sizes, page_width, max_rows)
     tiles = np.zeros((len(sizes), 5), dtype=np.int32)

@@ -22,8 +22,7 @@ def joined(colors: Tensor, alphas: Tensor | None) -> Tensor:
 
 
 def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
-    """Group surfels by tile size (r_u, r_v), given as [N, 2]. Returns list of (r_u, r_v, rows [M] int64), sizes
-    ascending, without surfels that have no tile."""
+    """Group surfels by tile size [N, 2], ascending, without those that have no tile: (r_u, r_v, rows [M] int64)."""
     # one integer per pair: torch.unique over rows is many times slower
     keys, inverse = torch.unique((sizes[:, 0].long() << 32) + sizes[:, 1].long(), return_inverse=True)
     found = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
@@ -35,9 +34,8 @@ def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
 
 
 def listed_tiles(sizes: Tensor, chunk: int = 1 << 20) -> Iterator[tuple[tuple[int, int], Tensor, Tensor]]:
-    """Yield the tiles of a texel list in chunks of one size, without surfels that have no tile: (r_u, r_v), rows [n]
-    int64 of the surfels, texel rows [n, r_v, r_u] int64. `sizes`: [N, 2] (r_u, r_v) of the tiles. `chunk`: texels per
-    chunk; tiles are never split."""
+    """Yield the tiles of a texel list in chunks of one size [N, 2], about `chunk` texels each, without surfels that
+    have no tile: (r_u, r_v), rows [n] int64 of the surfels, texel rows [n, r_v, r_u] int64."""
     first = first_texels(sizes)
     for r_u, r_v, members in size_classes(sizes):
         inside = torch.arange(r_u * r_v, device=sizes.device).view(r_v, r_u)
@@ -52,8 +50,8 @@ def first_texels(sizes: Tensor) -> Tensor:
 
 
 def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -> Tensor:
-    """Compute the flat index (layer * height + y) * width + x, [N, r_v, r_u] int64, of each texel of equally sized
-    tiles. `tiles`: [N, 5] int32 (x, y, layer, r_u, r_v). `size`: (r_u, r_v). `width`, `height`: page size in texels."""
+    """Compute the flat index (layer * height + y) * width + x, [N, r_v, r_u] int64, of each texel of tiles [N, 5] int32
+    (x, y, layer, r_u, r_v) of one size (r_u, r_v) in pages of `width` x `height` texels."""
     x, y, layer = tiles[:, 0].long(), tiles[:, 1].long(), tiles[:, 2].long()
     origin = (layer * height + y) * width + x  # [N]
     i, j = (torch.arange(side, device=tiles.device) for side in size)
@@ -98,8 +96,8 @@ def paged_texels(texels: Tensor, packing: Packing, elsewhere: float = 0.0) -> Te
 
 
 def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
-    """Return the alpha texels of a scene on its device, the mean alpha for a surfel without a tile; None if the scene
-    has no alpha. Raises ValueError: the atlas exists only as BC7 blocks."""
+    """Return the alpha texels of a scene on its device, the mean alpha for a surfel without a tile; None if it has no
+    alpha. Raises ValueError: the atlas exists only as BC7 blocks."""
     alphas, device = scene.alphas(), scene.tiles.device
     if alphas is None and scene.mean_alpha is None:
         return None

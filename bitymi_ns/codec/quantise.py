@@ -40,7 +40,6 @@ class Range:
         return np.rint(np.clip(unorm, 0.0, 1.0) * 255.0).astype(np.uint8)
 
     def from_unorm8(self, codes: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-        """Dequantise 8-bit codes."""
         return codes.astype(np.float32) * np.float32(self.scale / 255.0) + np.float32(self.offset)
 
 
@@ -73,7 +72,6 @@ class EncodedAtlas(Atlas):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the texels."""
         return sum(len(page) for page in self.payload)
 
     def pages(self) -> Tensor:
@@ -123,16 +121,10 @@ def encode(
     threads: int | None = None,
     progress: Progress = no_progress,
 ) -> EncodedAtlas:
-    """Quantise and encode an atlas, and measure the error of its stored colours.
-
-    Args:
-        texels: [layers, height, width, C] float32 residual colours and, where C = 4, alphas.
-        packing: layout of the tiles; errors are measured inside them only.
-        format: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA half floats, 8).
-        value_range: quantisation range, not used by fp16; None: `choose_range` with its defaults.
-        profile: effort of the BC7 encoder, from ultrafast to slow.
-        threads: encoder threads, without effect on the result; None: one per processor.
-    """
+    """Quantise and encode texels [layers, height, width, C] float32, residual colours and, where C = 4, alphas, and
+    measure the error of the stored colours inside the tiles. `format`: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16
+    (RGBA half floats, 8). `value_range`: not used by fp16; None: `choose_range` with its defaults. `threads`: of the
+    encoder, without effect on the result; None: one per processor."""
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")
     layers, height, width, channels = texels.shape
@@ -178,8 +170,7 @@ def encode(
 
 
 def round_to_bytes(texels: Tensor, packing: Packing, value_range: Range) -> tuple[Atlas, Tensor]:
-    """Round decoded texels [T, C] of a compact bundle, listed as in `pages.py`, as its readers do: the atlas, and its
-    `byte_pages`."""
+    """Round decoded texels [T, C] of a compact bundle as its readers do: the atlas, and its `byte_pages`."""
     colors = texels.numpy()[packing.of_tiles, :3]
     clipped, squares = _errors(colors, value_range.from_unorm8(value_range.to_unorm8(colors)), value_range)
     atlas = Atlas(

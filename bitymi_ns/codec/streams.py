@@ -20,8 +20,6 @@ class StreamError(ValueError):
 
 @dataclass(frozen=True)
 class Compressed:
-    """A compressed integer column."""
-
     sizes: list[int]  # bytes of each number
     data: bytes
 

@@ -37,8 +37,7 @@ CODED = {parameter.code: name for name, parameter in GEOMETRY_PARAMETERS.items()
 
 
 def columns_of(kind: str, has_alpha: bool, stated: Collection[str] | None = None) -> dict[str, int]:
-    """Count the numbers per row of the columns of surfels.bin, in their order. `stated`: columns of a file, which may
-    lack those of `LATER`."""
+    """Count the numbers per row of the columns of surfels.bin, in order; `stated` columns may lack those of `LATER`."""
     colors, shapes = term_numbers(kind)
     numbers = {"place": 1, "largest": 1, "rotation": 3, **{column: p.width for column, p in LINEAR.items()}, "size": 1}
     numbers |= {"residual": 3, **({"alpha": 1} if has_alpha else {}), "view_base": 3, "extent": 1, "view_count": 1}
@@ -140,18 +139,10 @@ class SurfelCodes:
 def code_surfels(
     surfels: Mapping[str, Tensor], kind: str, sizes: npt.ArrayLike, extent: Tensor, steps: Mapping[str, float]
 ) -> tuple[SurfelCodes, Tensor]:
-    """Quantise surfels and sort them in Morton order.
-
-    Args:
-        surfels: parameters by name, on the CPU, with lean view colours.
-        kind: a name of `ops.VIEW_COLORS`.
-        sizes: [N, 2] sides of the tiles, texels; (0, 0) = none.
-        extent: [N] half sides of the tiles, scale units.
-        steps: by column, as in `REFERENCE`; the step of place grows if its cells would exceed `POSITION_BITS`.
-
-    Returns:
-        the codes, and their order: [N] int64 rows of `surfels`.
-    """
+    """Quantise surfels and sort them in Morton order; returns the codes, and their order: [N] int64 rows of `surfels`.
+    `surfels`: on the CPU, with lean view colours. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none. `extent`:
+    [N] half sides of the tiles, scale units. `steps`: by column, as in `REFERENCE`; the step of place grows if its
+    cells would exceed `POSITION_BITS`."""
     values = {name: value.detach().double().numpy() for name, value in surfels.items()}
     frame, step, cell = _grid_cells(values["means"], steps["place"])
     steps = {**steps, "place": step}
@@ -232,7 +223,6 @@ def term_rows(span: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
 
 
 def quantised(values: npt.NDArray[np.float64], step: float) -> Codes:
-    """Round to multiples of a step."""
     return np.rint(values / step).astype(np.int64)
 
 

@@ -48,7 +48,6 @@ class Blocks:
 
     @property
     def name(self) -> str:
-        """Column name."""
         return f"{self.size[0]}x{self.size[1]}"
 
     @property
@@ -202,15 +201,11 @@ class TexelCoder:
     """Texel coder of fixed tiles, weighted by their coverage in the views."""
 
     def __init__(self, sizes: Tensor, weights: Tensor, step: float = STEP, first: TexelCodes | None = None) -> None:
-        """
-        Args:
-            sizes: [N, 2] sides of the tiles; (0, 0) = one constant.
-            weights: [T] texel weights, in the order of `TexelTiles`: sum over views and fragments of the squared
-                blending weight times the bilinear weight. A texel error e adds weight times e^2 to the pictures.
-            step: of a coefficient, in 8-bit steps, for texels that cover one pixel of the views; step / sqrt(w) if they
-                cover w pixels.
-            first: earlier codes, whose alphas and grades are kept; None: start afresh.
-        """
+        """Take tiles of sides `sizes` [N, 2], (0, 0) = one constant, and texel weights [T], in the order of
+        `TexelTiles`: sum over views and fragments of the squared blending weight times the bilinear weight. A texel
+        error e adds weight times e^2 to the pictures. `step`: of a coefficient, in 8-bit steps, for texels that cover
+        one pixel of the views; step / sqrt(w) if they cover w pixels. `first`: earlier codes, whose alphas and grades
+        are kept; None: start afresh."""
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
         self._step = step / 255
         self.blocks = blocks_of(self._sizes)
@@ -223,10 +218,8 @@ class TexelCoder:
         self.alpha: AlphaCodes | None = None if first is None else first.alpha
 
     def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Code texels [T, 3] in at most `most_bytes`, alphas included, enlarging the step if needed.
-
-        Bytes fall about as 1 / step.
-        """
+        """Code texels [T, 3] in at most `most_bytes`, alphas included, enlarging the step if needed: bytes fall about
+        as 1 / step."""
         codes = self.code(texels, rounds)
         for _ in range(_ATTEMPTS):
             found = codes.nbytes()
@@ -262,11 +255,9 @@ class TexelCoder:
 
     @torch.no_grad()
     def code(self, texels: Tensor, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Code texels [T, 3], with the alphas coded before.
-
-        Coefficients c minimise sum over texels of weight (t - t(c))^2 plus an L1 penalty, by `rounds` iterations of
-        ISTA (a gradient step and soft thresholding). Unseen texels thus take the values that cost least.
-        """
+        """Code texels [T, 3], with the alphas coded before. Coefficients c minimise sum over texels of weight (t -
+        t(c))^2 plus an L1 penalty, by `rounds` iterations of ISTA (a gradient step and soft thresholding). Unseen
+        texels thus take the values that cost least."""
         residual = residual_codes(self._means(texels))
         codes = TexelCodes(self._sizes, self._step, residual, RESIDUAL_STEP, self.grades, [], self.alpha)
         return replace(codes, coefficients=self._coefficients(texels, codes.constants, self._step, rounds))
@@ -303,7 +294,6 @@ def _shared(means: Tensor, sizes: Tensor, steps: Tensor) -> dict[str, Any]:
 
 
 def _block_arguments(blocks: Blocks) -> dict[str, Any]:
-    """Build the kernels' arguments for the blocks of one size."""
     width, height = blocks.size
     order = torch.tensor([k_v * width + k_u for k_v, k_u in blocks.order])
     cosines = {"down": _cosines(height), "across": _cosines(width)}

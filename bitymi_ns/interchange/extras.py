@@ -44,8 +44,6 @@ COLORED_VIEWS = 64  # most training views that colour a mesh
 
 @dataclass(frozen=True)
 class ExtraFile:
-    """A written file."""
-
     file: str  # name
     bytes: int  # size
     count: int  # Gaussians or quads
@@ -104,22 +102,12 @@ def write_extras(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> dict[str, ExtraFile]:
-    """Write a folder with a file per kind and extras.json, which states them. The folder is complete or absent.
-
-    Args:
-        bundle: on the CPU, texels decoded.
-        frame: of the files: the scene's or the capture's, by the transform of bundle.json.
-        cameras: of the training photographs, to fit colours to. Without cameras harmonics are fitted over the whole
-            sphere, and a mesh keeps the surfels' colours.
-        overwrite: replace a folder of extras.
-
-    Returns:
-        The written files, by kind.
-
-    Raises:
-        BundleError: as `check_extras`; the bundle has no surfel for a mesh; the transform to the capture's frame is no
-            similarity; or the folder cannot be written.
-    """
+    """Write a folder with a file per kind and extras.json, which states them; return these by kind. The folder is
+    complete or absent. `bundle`: on the CPU, texels decoded. `frame`: of the files: the scene's or the capture's, by
+    the transform of bundle.json. `cameras`: of the training photographs, to fit colours to. Without cameras harmonics
+    are fitted over the whole sphere, and a mesh keeps the surfels' colours. Raises BundleError: as `check_extras`; the
+    bundle has no surfel for a mesh; the transform to the capture's frame is no similarity; or the folder cannot be
+    written."""
     folder = Path(folder)
     reserve_extras(kinds, folder, overwrite)
     to = to_capture(bundle.info.world) if frame == "capture" else None
@@ -165,5 +153,4 @@ def write_extras(
 
 
 def summary_line(written: ExtraFile) -> str:
-    """Summarise a written file in one line."""
     return f"{written.file}: {written.count:,}, {written.bytes / 1e6:.2f} MB" + (written.note and f"; {written.note}")

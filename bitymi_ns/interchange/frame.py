@@ -38,8 +38,8 @@ class Similarity:
         return (self.scale * (points.double() @ self.turn.T) + self.shift).to(points)
 
     def rotations(self, quats: Tensor) -> Tensor:
-        """Transform rotations to the new frame, [N, 4] float64 unit quaternions wxyz. For a reflection the third axis
-        is inverted, which does not change a disc or a Gaussian."""
+        """Transform rotations to the new frame, [N, 4] float64 unit quaternions wxyz; for a reflection with the third
+        axis inverted."""
         old = Rotation.from_quat(quats.detach().double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
         new = self.turn.numpy() @ old
         new[:, :, 2] *= np.linalg.det(self.turn.numpy())
@@ -47,8 +47,7 @@ class Similarity:
 
 
 def to_capture(place: WorldEntry) -> Similarity:
-    """Invert x_scene = scale * (transform @ [x_capture, 1]). Raises BundleError: the transform is no similarity, so
-    that discs would not remain discs."""
+    """Invert x_scene = scale * (transform @ [x_capture, 1]). Raises BundleError: discs would not remain discs."""
     transform = torch.tensor(place.transform, dtype=torch.float64)
     matrix, offset = transform[:, :3], transform[:, 3]
     stretch = float(torch.linalg.det(matrix).abs()) ** (1 / 3)

@@ -56,7 +56,6 @@ class Gaussians:
         return Gaussians(**{name: value[rows] for name, value in vars(self).items()})
 
     def moved(self, to: Similarity) -> Gaussians:
-        """Transform to another frame."""
         coefficients = harmonics.rotation_of(to.turn.T) @ self.harmonics.double()
         return replace(
             self,
@@ -134,8 +133,7 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = (), flat: bool = False) -> None:
-    """Write Gaussians as a 3DGS PLY file. `comments`: lines of the header. `flat`: omit the third scales, and state so
-    in a comment (`FLAT`)."""
+    """Write a 3DGS PLY file; `flat`: without the third scales, which a comment states (`FLAT`)."""
     values = {
         "means": gaussians.means,
         "normals": torch.zeros_like(gaussians.means),

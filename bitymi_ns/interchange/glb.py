@@ -30,9 +30,8 @@ def upright(up: Tensor, origin: Tensor | None = None) -> np.ndarray:
 
 
 def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
-    """Encode quads as glTF: a mesh per page with the page as PNG, two triangles per quad, double-sided and unlit
-    (KHR_materials_unlit). The sampler has no mip levels, which would mix tiles. `quads`: at least one. `place`:
-    transform of the node, of `upright`."""
+    """Encode at least one quad as glTF: a mesh per page with the page as PNG, two triangles per quad, double-sided and
+    unlit (KHR_materials_unlit). The sampler has no mip levels, which would mix tiles. `place`: of `upright`."""
     scene = trimesh.Scene()
     for page in torch.unique(quads.page).tolist():
         rows = torch.nonzero(quads.page == page).squeeze(1)
@@ -51,8 +50,8 @@ def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
 
 
 def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> bytes:
-    """Encode a surface as glTF: a mesh with linear vertex colors, lit and double-sided. `normals`: [V, 3] unit vertex
-    normals. `place`: transform of the node, of `upright`."""
+    """Encode a surface with vertex normals [V, 3] as glTF: linear vertex colors, lit and double-sided. `place`: of
+    `upright`."""
     linear = np.where(mesh.colors <= 0.04045, mesh.colors / 12.92, ((mesh.colors + 0.055) / 1.055) ** 2.4)
     shape = trimesh.Trimesh(
         mesh.vertices,

@@ -36,25 +36,18 @@ class Quads:
         return len(self.corners)
 
     def moved(self, to: Similarity) -> Quads:
-        """Transform to another frame."""
         return replace(self, corners=to.points(self.corners))
 
 
 @torch.no_grad()
 def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
-    """Convert the surfels of a scene to quads.
+    """Convert the surfels of a scene on the CPU, with its texels decoded, to quads.
 
-    A quad is the square around the disc in which the surfel's opacity o k = o (1 - r^2 / R^2)^beta is at least `level`.
-    Its alpha is 1 - r^2 / (2 radius^2), which is 0.5 at the rim of the disc. With alpha texels m the opacity is o k m:
-    the disc is that of the largest m, and alpha is at most o k m / (2 level). A surfel below the level everywhere has
-    no quad. Colours are max(color + residual, 0). Texels are resampled from the surfel's tile, at about its resolution,
-    with the outer texel centres at the corners.
-
-    Args:
-        scene: N surfels on the CPU, with its texels decoded.
-        color: [N, 3] colour of each surfel without its residual.
-        level: opacity at which quads end, in (0, 1).
-    """
+    A quad is the square around the disc in which the surfel's opacity o k = o (1 - r^2 / R^2)^beta is at least `level`,
+    in (0, 1). Its alpha is 1 - r^2 / (2 radius^2), which is 0.5 at the rim of the disc. With alpha texels m the opacity
+    is o k m: the disc is that of the largest m, and alpha is at most o k m / (2 level). A surfel below the level
+    everywhere has no quad. Colours are max(color + residual, 0), with `color` [N, 3]. Texels are resampled from the
+    surfel's tile, at about its resolution, with the outer texel centres at the corners."""
     surfels = scene.surfels
     opacity = torch.sigmoid(surfels["opacity_logits"].double()) * _largest_alpha(scene)
     kept = torch.nonzero(opacity > level).squeeze(1)
@@ -79,9 +72,9 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
 
 
 def fetch_texels(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Fetch texels bilinearly, clamped to the outer texel centres of each tile: [n, r_v, r_u, 4] residual colour and
-    alpha; alpha is 0 if the scene has no alpha texels. `scene`: on the CPU, with an atlas. `tiles`: [n, 5] int64, of
-    the scene. `u`, `v`: [n, r_u] and [n, r_v] coordinates in half sides of the tiles, from -1 to 1 inside."""
+    """Fetch texels of tiles [n, 5] int64 bilinearly, clamped to their outer texel centres, on the CPU: [n, r_v, r_u, 4]
+    residual colour and alpha, 0 without alpha texels. `u`, `v`: [n, r_u], [n, r_v] in half sides of the tiles, from -1
+    to 1 inside."""
     assert scene.atlas is not None
     _, height, width, _ = scene.atlas.shape
     (low_u, high_u, fu), (low_v, high_v, fv) = (

@@ -62,19 +62,10 @@ def median_depth(
     near: float,
     alpha: TexelAlpha | None = None,
 ) -> Tensor:
-    """Compute the median depth of each pixel, at which the accumulated blending weight reaches 0.5.
-
-    Args:
-        surfels: geometry by name (`GEOMETRY`), of N surfels.
-        near: near plane, camera z.
-        alpha: opacities of the surfels' texels; None: opaque texels.
-
-    Returns:
-        [H, W] camera z of the fragment that reaches it; 0 if none does.
-
-    Raises:
-        TooManyFragments: a single row of screen tiles has more fragments than memory holds.
-    """
+    """Compute the median depth [H, W], camera z of the fragment at which the accumulated blending weight reaches 0.5; 0
+    if none does. `surfels`: geometry by name (`GEOMETRY`). `near`: near plane, camera z. `alpha`: opacities of the
+    surfels' texels; None: opaque texels. Raises TooManyFragments: a single row of screen tiles has more fragments than
+    memory holds."""
     projection = project(*geometry_of(surfels), camera=camera, near=near, alpha=alpha)
     rows = []
     for fragments in fitting_lists(projection):
@@ -126,19 +117,10 @@ def extract_surface(
     alpha: TexelAlpha | None = None,
     to: Similarity | None = None,
 ) -> Triangles:
-    """Fuse the median depths of views into a triangle mesh with vertex colors.
-
-    Args:
-        surfels: geometry by name (`GEOMETRY`).
-        render: renders the colors [H, W, 3] of a view, for the vertices.
-        near: near plane, camera z.
-        alpha: as in `median_depth`.
-        to: transform to the mesh's frame; None: the scene's frame.
-
-    Raises:
-        NoSurface: there is nothing to fuse.
-        ValueError: an option is out of range.
-    """
+    """Fuse the median depths of views into a triangle mesh with vertex colors. `surfels`, `near`, `alpha`: as in
+    `median_depth`. `render`: renders the colors [H, W, 3] of a view, for the vertices. `to`: transform to the mesh's
+    frame; None: the scene's frame. Raises NoSurface: there is nothing to fuse. Raises ValueError: an option is out of
+    range."""
     import open3d
 
     options = options or SurfaceOptions()

@@ -15,9 +15,8 @@ MeshFormat = Literal["ply", "glb", "obj"]
 
 
 def mesh_bytes(mesh: Triangles, form: MeshFormat, up: Tensor, origin: Tensor, note: str = "") -> bytes:
-    """Encode a mesh file with vertex colors and normals. PLY and OBJ keep the mesh's axes and have the note as a
-    comment; glTF has +y up and the origin in its node. `up`: [3] up direction of the mesh. `origin`: [3] origin of the
-    positions. `note`: one line that states the origin; empty: none."""
+    """Encode a mesh with vertex colors and normals. PLY and OBJ keep its axes and have the note on the origin, one line
+    or empty, as a comment; glTF has +y up and the origin in its node. `up`, `origin`: [3]."""
     normals = _normals(mesh)
     if form == "glb":
         return surface_glb(mesh, normals, upright(up, origin))
@@ -30,7 +29,6 @@ def mesh_bytes(mesh: Triangles, form: MeshFormat, up: Tensor, origin: Tensor, no
 
 
 def _normals(mesh: Triangles) -> np.ndarray:
-    """Compute unit vertex normals [V, 3] float32, area-weighted means of the triangles' normals."""
     a, b, c = (mesh.vertices.astype(np.float64)[corner] for corner in mesh.faces.T)
     total = np.zeros(mesh.vertices.shape)
     for corner in mesh.faces.T:

@@ -41,14 +41,8 @@ def fit_colors(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers
     The colour is max(max(f_view(d) + 0.5, 0) + residual, 0). Directions are those of `bake.directions` (of all training
     views that show the surfel, and 32 between and around them), with a total weight of 1, and OUTSIDE directions over
     the whole sphere with a total weight of OUTSIDE_WEIGHT, which regularise the fit elsewhere. A surfel that no view
-    shows has directions over the sphere only.
-
-    Args:
-        scene: N surfels on the CPU.
-        residual: [N, 3] residual colour of each surfel; None: no residual.
-        seen: [V, N] bool, the views that show each surfel; V may be 0.
-        centers: [V, 3] float64 camera centres, the scene's frame.
-    """
+    shows has directions over the sphere only. `scene`: N surfels on the CPU. `residual`: [N, 3]; None: no residual.
+    `seen`: [V, N] bool; V may be 0. `centers`: [V, 3] float64 camera centres, the scene's frame."""
     surfels = scene.surfels
     means = surfels["means"]
     found = SurfelColors(means.new_zeros(len(means), harmonics.TERMS, 3), means.new_zeros(len(means), 3))

@@ -111,7 +111,7 @@ def closed(mesh: Triangles) -> Triangles:
 
 def solid(mesh: Triangles, smallest: float) -> Triangles:
     """Clean and close a mesh, orient its triangles outwards, and remove components of less than a share `smallest` of
-    the triangles of the largest one. `open_edges` counts the edges that could not be closed."""
+    the triangles of the largest one; `open_edges` counts what could not be closed."""
     for _ in range(_ATTEMPTS):
         mesh = closed(cleaned(mesh).without_specks(smallest)).without_specks(smallest)  # also specks cut off by closing
         if len(cleaned(mesh)) == len(mesh):
@@ -145,8 +145,7 @@ def _joined(mesh: Triangles, to: npt.NDArray[np.int64]) -> Triangles:
 
 
 def _in_largest_fans(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Find the triangles, [F] bool, whose corners are all in the largest fan around their vertex. A fan is a sequence
-    of adjacent triangles around a vertex; directed edges must be unique."""
+    """Find the triangles, [F] bool, whose corners are all in the largest fan of adjacent ones around their vertex."""
     count = len(faces)
     corner = np.arange(3 * count).reshape(3, count)  # of the first vertices, the second, the third
     first, second = corner.ravel(), np.roll(corner, -1, axis=0).ravel()  # corners at both ends of `_directed` edges

@@ -23,17 +23,13 @@ def check_usd() -> None:
 
 
 def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None:
-    """Write a binary USD file with a ParticleField prim per kernel.
+    """Write a binary USD file, .usdc, with a ParticleField prim per kernel.
 
     A surflet is a disc in its xy plane with kernel exp(-r^2 / 2) (GaussianSurfletAPI), or 1 up to r = 1
     (ConstantSurfletAPI), and its own scales, orientation, position and opacity. Spherical harmonics have degree 3, the
-    basis and offset of 3DGS, and give sRGB colors, as the attribute's color space states.
-
-    Args:
-        path: ends in .usdc.
-        gaussians: at least one; third scales are omitted, discs (`Gaussians.hard`) get twice the scales.
-        place: transform [4, 4] of the root, from the Gaussians' frame to one with +y up; its unit is taken as a metre.
-    """
+    basis and offset of 3DGS, and give sRGB colors, as the attribute's color space states. Third scales are omitted,
+    discs (`Gaussians.hard`) get twice the scales. `place`: transform [4, 4] of the root, from the Gaussians' frame to
+    one with +y up; its unit is taken as a metre."""
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
     stage = Usd.Stage.CreateNew(str(path))
@@ -78,5 +74,4 @@ def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None
 
 
 def _vectors(kind: Any, values: Tensor) -> object:
-    """Convert float32 rows to a USD array."""
     return kind.FromNumpy(np.ascontiguousarray(values.numpy()))

@@ -55,8 +55,6 @@ class PageError(ValueError):
 
 @dataclass(frozen=True)
 class Site:
-    """Files served."""
-
     files: Mapping[str, Callable[[], bytes | bytearray]]  # path without leading slash -> reader of the contents
     left_out: Sequence[str] = ()  # files listed in the bundle but not served
     notes: Callable[[], bytes | None] = lambda: None  # reads the bundle's current notes.json; None: there is none
@@ -86,7 +84,7 @@ class Site:
 
     def read(self, path: str) -> bytes | bytearray:
         """Read one of `paths`. Raises BundleError: a file of the bundle is missing, altered, or a link out of the
-        bundle. Raises OSError: a file of the page cannot be read."""
+        bundle."""
         if path == _NOTES:
             notes = self.notes()
             if notes is None:
@@ -98,7 +96,6 @@ class Site:
 
 
 def media_type(path: str) -> str:
-    """Return the media type for a name's extension; application/octet-stream if unknown."""
     return TYPES.get(Path(path).suffix.lower(), "application/octet-stream")
 
 
@@ -114,8 +111,7 @@ def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
 
 def site_of(bundle: Path) -> Site:
     """Build a site of the page and a bundle; parts of a single-file bundle are served as separate files. Raises
-    PageError: the page was not built. Raises BundleError: there is no bundle, or its bundle.json or notes.json is
-    damaged."""
+    PageError: the page was not built; BundleError: there is no bundle, or its bundle.json or notes.json is damaged."""
     notes_of(bundle)
     shown = Shown(Path(os.path.realpath(bundle)))
     files = {**page_files(), "view.json": partial(_view_json, bundle)}
@@ -124,8 +120,7 @@ def site_of(bundle: Path) -> Site:
 
 def single_site(bundle: Path) -> Site:
     """Build a site of the page and a single-file bundle, which the page reads by range requests, or as a whole if the
-    server does not support them. Raises PageError: the page was not built. Raises BundleError: there is no bundle, or
-    it is damaged."""
+    server does not support them. Raises as `site_of`."""
     info, files = read_manifest(bundle), page_files()
     empty, named = (_BUNDLE_TAG.format(name).encode() for name in ("", SINGLE))
     index = files["index.html"]()
@@ -194,16 +189,10 @@ class Shown:
 
 
 def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
-    """Write the files of a site to a folder, which is complete or absent; return the bytes written.
-
-    Args:
-        overwrite: replace an exported page.
-
-    Raises:
-        PageError: the folder holds other files, or an exported page without `overwrite`.
-        BundleError: a file of the bundle is missing, altered, or a link out of the bundle.
-        OSError: the folder cannot be written.
-    """
+    """Write the files of a site to a folder, which is complete or absent; return the bytes written. `overwrite`:
+    replace an exported page. Raises PageError: the folder holds other files, or an exported page without `overwrite`.
+    Raises BundleError: a file of the bundle is missing, altered, or a link out of the bundle. Raises OSError: the
+    folder cannot be written."""
 
     def check() -> None:
         has_folder = (folder / BUNDLE / MANIFEST).is_file()

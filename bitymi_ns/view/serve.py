@@ -169,7 +169,6 @@ class _Server(ThreadingHTTPServer):
         return held
 
     def release(self, held: _SharedFile) -> None:
-        """Drop a file once it has no readers."""
         with self._count_lock:
             held.readers -= 1
             if not held.readers:
@@ -202,18 +201,9 @@ class _Server(ThreadingHTTPServer):
 def serve(
     site: Site, host: str = LOOPBACK, port: int = 0, request_seconds: float = REQUEST_SECONDS
 ) -> ThreadingHTTPServer:
-    """Create a listening server; call its `serve_forever`, and `address_of` for the URL.
-
-    Args:
-        site: files to serve; other paths are not found.
-        host: address to listen at. On a loopback address, requests for another host name are refused, against DNS
-            rebinding by web pages.
-        port: 0: any free port.
-        request_seconds: timeout of receiving a request.
-
-    Raises:
-        PageError: the address cannot be used.
-    """
+    """Create a listening server; call its `serve_forever`, and `address_of` for the URL. On a loopback `host`, requests
+    for another host name are refused, against DNS rebinding by web pages. `port`: 0: any free port. `request_seconds`:
+    timeout of receiving a request. Raises PageError: the address cannot be used."""
     if not 0 <= port <= 0xFFFF:
         raise PageError(f"the port must be from 0 to 65535, not {port}")
     try:

@@ -10,16 +10,7 @@ import pytest
 import torch
 
 from bitymi_ns.bake import Coded, Reduced, Rounded, Stage, TuneOptions, compact, export, tune_atlas
-from bitymi_ns.bake.compact import (
-    ENOUGH,
-    MAX_LAMBDA,
-    START,
-    TEXEL_SHARE,
-    Coder,
-    Compact,
-    choose,
-    compacted,
-)
+from bitymi_ns.bake.compact import ENOUGH, MAX_LAMBDA, START, TEXEL_SHARE, Coder, Compact, compacted
 from bitymi_ns.bake.precision import PER_BIT
 from bitymi_ns.bundle import check_files
 from bitymi_ns.train.views import View
@@ -108,17 +99,18 @@ def test_surfels_and_texels_fit_into_the_bytes_there_are(truth: Reduced, views: 
         compacted(truth, views, BACKGROUND, Compact(most_bytes=300))
 
 
-def test_a_size_that_the_coarsest_texels_exceed_is_refused() -> None:
+def test_a_size_that_the_coarsest_texels_exceed_is_refused(truth: Reduced, monkeypatch: pytest.MonkeyPatch) -> None:
     baked = SimpleNamespace(rows=range(60), codes=SimpleNamespace(nbytes=lambda: 1000))
     point = SimpleNamespace(bytes=5000, error=0.1, baked=baked)
     coder: Any = SimpleNamespace(measured=True, allowed=lambda share: 0.01, at=lambda lmbda: point)
+    monkeypatch.setattr(compact, "Coder", lambda *_: coder)
     with pytest.raises(ValueError, match=r"3,000 bytes are too few for 60 surfels, which take at least 5,000"):
-        choose(coder, Compact(most_bytes=3000))
+        compacted(truth, [], BACKGROUND, Compact(most_bytes=3000))
 
 
 def test_bytes_that_buy_nothing_are_not_spent(truth: Reduced, views: list[View]) -> None:
     coder = Coder(truth, views, BACKGROUND, Compact(views=len(views)))
-    kept = choose(coder, Compact(most_bytes=10**9))
+    kept = compacted(truth, views, BACKGROUND, Compact(views=len(views), most_bytes=10**9))
     fewer, more = kept.statistics.rounding.alternatives
     assert 0.45 < fewer[0] < 0.55 and 1.8 < more[0] < 2.2 and fewer[1] < more[1]
     assert kept.statistics.rounding.mse <= 1.001 * ENOUGH * coder.error

@@ -51,13 +51,10 @@ def _polish_run(
     """Set up a training run that consists of the texel stage alone and keeps the number of surfels."""
     texels = TexelList(baked)
     drawn, tiles = texels.scene, texels.tiles
-    share = 1.0 / (texels.coverage(views, progress)[:, 0] + options.prior)
-    config = SceneConfig(
-        texture="texels",
-        view_color=kind_of(drawn.surfels),
-        weight_bound=drawn.weight_bound,
-    )
-    scene = Scene(config, drawn.surfels, TexelField(tiles.size, tiles.extent, texels.values, share), near=drawn.near)
+    step_size = 1.0 / (texels.coverage(views, progress)[:, 0] + options.prior)
+    config = SceneConfig(texture="texels", view_color=kind_of(drawn.surfels), weight_bound=drawn.weight_bound)
+    field = TexelField(tiles.size, tiles.extent, texels.values, step_size)
+    scene = Scene(config, drawn.surfels, field, near=drawn.near)
     train = replace(
         train,
         loss=LossConfig(ssim_weight=options.ssim_weight, falloff_weight=0.0, depth_weight=0.0, normal_weight=0.0),
@@ -78,7 +75,6 @@ def _polish_run(
 
 @torch.no_grad()
 def _psnr(run: Trainer, background: Tensor, views: Sequence[View], progress: Progress = no_progress) -> float:
-    """Average the PSNR, dB, over views with an unmasked pixel."""
     moved = (view.to(background.device) for view in views)
     drawn = ((view, run.scene.render(view.camera, background)) for view in moved)
     pictures = (
@@ -105,19 +101,13 @@ def polish_scene(
     step that is not finite takes the scene back to that state, with smaller rates.
 
     Args:
-        baked: a bake with texels and all of its view colours, made with `pixels_per_texel`.
+        baked: with texels and all of its view colours, made with `pixels_per_texel`.
         views: training views, with the corrections that training found; every `val_every`-th is for validation.
         background: [3] colour behind the scene, except in training where `train.background` changes it by step.
-        train: options of the training, for the learning rates, the colours behind the scene, and for what is done when
-            a step is not finite.
         eval_views: views of which the gain is stated; they decide nothing.
 
-    Returns:
-        a new bake with `statistics.polish`; with fewer than 4 views, `baked` with 0 steps in it.
-
-    Raises:
-        ValueError: there is no atlas, the view colours are reduced, or an option is out of range.
-    """
+    Returns a new bake with `statistics.polish`; with fewer than 4 views, `baked` with 0 steps in it. Raises ValueError:
+    there is no atlas, the view colours are reduced, or an option is out of range."""
     options = options or PolishOptions()
     options.check()
     if len(views) < FEWEST_VIEWS:

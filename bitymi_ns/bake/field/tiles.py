@@ -52,22 +52,14 @@ def field_tiles(
     pixels_per_texel: float | None = None,
     progress: Progress = no_progress,
 ) -> Trained:
-    """Give the surfels of a bake tiles with the values of a field at the texel centres; leave out surfels as
-    `prune.drop_unseen` does. The tiles are not reduced yet (`prune.prune_and_resample`).
+    """Give the surfels of a bake without tiles, tiles with the values of a field at the texel centres; leave out
+    surfels as `prune.drop_unseen` does. The tiles are not reduced yet (`prune.prune_and_resample`).
 
     With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it nothing is seen: the
     field is read at the nearest point of the disc, so values stay smooth and within the range of what is seen.
-
-    Args:
-        baked: without tiles.
-        field: on the device of the scene.
-        cameras: training views, for the cap on tile sizes and for what they see.
-        pixels_per_texel: a tile gets at most one texel per this number of pixels that its surfel fills in the view that
-            shows most of it; None = as many as field and views resolve.
-
-    Raises:
-        ValueError: no surfel is left, or the atlas would be too large.
-    """
+    `cameras`: training views, for the cap on tile sizes and for what they see. `pixels_per_texel`: a tile gets at most
+    one texel per this number of pixels that its surfel fills in the view that shows most of it; None = as many as field
+    and views resolve. Raises ValueError: no surfel is left, or the atlas would be too large."""
     options, paper = baked.options, _paper_texels(baked, field)
     baked, inputs = drop_unseen(baked, cameras, progress)
     sizes, extent, counts = grids(inputs, field, options, pixels_per_texel)
@@ -138,5 +130,4 @@ def _paper_texels(baked: Trained, field: Field) -> int:
 
 
 def _texels(sizes: Tensor) -> int:
-    """Count the texels of tiles of sizes [N, 2]."""
     return int(sizes.long().prod(1).sum())

@@ -54,7 +54,6 @@ class CompactOptions:
     bundle that reaches it. Held-out views reach less."""
 
     def check_compact(self, form: BundleFormat) -> None:
-        """Stop if an option is out of range, or for another format."""
         compact = form == "compact"
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if not compact and getattr(self, name) != getattr(CompactOptions, name):
@@ -87,8 +86,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
     """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest.
 
     Writes the bundle aside, renames and opens it, and compares it with the trained scene and the photographs on the
-    held-out views.
-    """
+    held-out views."""
 
     load_config: Path  # config.yml of a trained scene.
     output_dir: Path  # Folder of the bundle.

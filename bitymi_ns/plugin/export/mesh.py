@@ -114,8 +114,7 @@ def from_run(load_config: Path) -> MeshScene:
 
 
 def from_bundle(folder: Path, crop: bool = False) -> MeshScene:
-    """Load a bundle with its training cameras, cropped as by `read_bundle`. Raises BundleError: it cannot be read, or
-    has no cameras."""
+    """Load a bundle with its training cameras. Raises BundleError: it cannot be read, or has no cameras."""
     bundle = read_bundle(folder, crop=crop)
     if bundle.hidden:
         say(f"{bundle.hidden}.")

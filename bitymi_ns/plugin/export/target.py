@@ -22,7 +22,6 @@ TYPICAL_SIDE = 32  # side of a tile in texels, generously: within a tolerance mo
 
 
 def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool) -> None:
-    """Stop if there may be too little room for a bundle."""
     needed, free = space_needed(load_config, options, exact), free_bytes(folder)
     if free < needed:
         beside = " beside the earlier one" if folder.exists() else ""

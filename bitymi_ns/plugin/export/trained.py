@@ -103,9 +103,7 @@ def _encoded(image: torch.Tensor, format: str, most: int | None = None, **option
 
 @torch.no_grad()
 def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
-    """Average PSNR in dB over the held-out views: bundle, trained scene and photographs against each other, also after
-    the affine fit of each view's colours to its photograph; and the worst of the bundle against the trained scene. The
-    run's exposures are interpolated."""
+    """Average `held_out_psnr` in dB over the held-out views, with the worst of the bundle against the trained scene."""
     rows = held_out_psnr(model, datamanager, scene, len(datamanager.eval_dataset))
     names = ("psnr_baked_against_neural", "psnr_neural_against_photos", "psnr_baked_against_photos")
     names += ("fitted_psnr_neural_against_photos", "fitted_psnr_baked_against_photos")
@@ -116,8 +114,8 @@ def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
 
 @torch.no_grad()
 def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views: int) -> list[list[float]]:
-    """Compute PSNR of the first `views` held-out views on the model's device, a row each: bundle against trained scene,
-    trained scene against photograph, bundle against photograph, and these two after the affine fit of colours."""
+    """Compute PSNR of the first `views` held-out views, a row each: bundle against trained scene, trained scene against
+    photograph, bundle against photograph, and these two after the affine fit of colours."""
     rows = []
     scene, background = scene.to(model.device), model.background
     held_out = datamanager.corrected_eval_views(model.resume_state.get("exposure"))

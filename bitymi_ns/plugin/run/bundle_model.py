@@ -121,8 +121,8 @@ class BakedModel(SurfelModel):
 
 
 def check_same_capture(bundle: Path, pipeline: Any) -> None:
-    """Check before a comparison that a bundle is of the capture that a pipeline has read, in the same frame: half of
-    its cameras need one of the capture's within 5 % of their extent and 5 degrees. Raises InputError: it is not."""
+    """Check that a bundle is of the capture that a pipeline has read, in the same frame: half of its cameras need one
+    of the capture's within 5 % of their extent and 5 degrees. Raises InputError: it is not."""
     stated = [row.camera for row in read_cameras(bundle)]
     if not stated:
         return

@@ -102,7 +102,6 @@ class TrainingRun:
         self._longest_side = max(max(camera.width, camera.height) for camera in cameras)
 
     def _forecast(self, pixels: Sequence[int], surfels: Steps) -> Forecast:
-        """Prepare the estimate of the run's end, from pixels of its training views and surfels of its steps."""
         held_out = len(self.datamanager.eval_dataset)
         at_once = min(held_out, self._curve_views or held_out)
         evaluated = {step: held_out if step + 1 >= self.total else at_once for step in self.curve_steps}

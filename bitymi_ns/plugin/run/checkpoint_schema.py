@@ -111,8 +111,8 @@ def _kind(value: Any) -> str:
 
 
 def check_unwritten(state: Mapping[str, Any], scene: SceneConfig) -> None:
-    """Check a checkpoint before it is written, on any device and without a copy: all entries, and the optimisers'
-    states against their parameters. Raises Misfit: an entry is missing or wrong."""
+    """Check a checkpoint before it is written, on any device and without a copy, as `check_entries`, and the
+    optimisers."""
     parameters = check_entries(state, scene)
     for optimizer in Entry(state["optimizers"], "optimizers").parts():
         group = optimizer.name.removeprefix("optimizers.")
@@ -122,7 +122,7 @@ def check_unwritten(state: Mapping[str, Any], scene: SceneConfig) -> None:
 
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
     """Check all entries of a checkpoint, and return the names of parameters with numbers that are not finite, or too
-    large to be drawn. Raises Misfit: an entry is missing or wrong."""
+    large to be drawn. Raises as `check_entries`."""
     drawable = {
         name.removeprefix("_model."): (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
         for name, values in check_entries(state, scene).items()
@@ -164,7 +164,6 @@ def check_entries(state: Mapping[str, Any], scene: SceneConfig) -> dict[str, Ten
 
 
 def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
-    """Check a scene's parameters, and return them by name."""
     n = len(pipeline[f"{SURFELS}means"].tensor(None, 3))
     if n == 0:
         raise Misfit("it holds no surfels")
@@ -230,7 +229,7 @@ def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
 
 def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
     """Check and load the state of an optimiser of one group, with the file's learning rate and this run's other
-    options. Raises Misfit: see `check_optimizer`."""
+    options."""
     check_optimizer(saved, [parameter for group in optimizer.param_groups for parameter in group["params"]])
     groups = optimizer.state_dict()["param_groups"]
     groups[0]["lr"] = saved.value["param_groups"][0]["lr"]
@@ -238,7 +237,6 @@ def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
 
 
 def _check_run(run: Entry, rows: int, step: int) -> None:
-    """Check a run's state beside parameters and optimisers."""
     if (length := run.get("max_steps")) is not None:
         length.count(1)
     if (start := run.get("texels_start")) is not None:

@@ -159,7 +159,6 @@ class BitymiTrainerConfig(TrainerConfig):
         say(self.summary())
 
     def summary(self) -> str:
-        """Describe method, capture, length, device and output folder, a line each."""
         resumed = self.load_dir or self.load_checkpoint
         lines = {
             "method": self.method_name,

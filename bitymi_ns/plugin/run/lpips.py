@@ -91,8 +91,8 @@ def weights_path(backbone: str) -> Path:
 
 
 def load(backbone: str) -> dict[str, npt.NDArray[np.float32]]:
-    """Load, or fetch, a backbone's weights: kernel_K [out, in, side, side], bias_K [out], and head_K [channels] of the
-    taps. Raises LpipsUnavailable: they are not available."""
+    """Load, or fetch, weights: kernel_K [out, in, side, side], bias_K [out], head_K [channels]. Raises
+    LpipsUnavailable."""
     path = weights_path(backbone)
     if not path.is_file():
         if os.environ.get("BITYMI_NO_DOWNLOAD"):

@@ -58,8 +58,8 @@ SPREAD = 1.3  # factor of the stated figures to either side of the estimate
 
 @torch.no_grad()
 def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
-    """Estimate the most fragments at once of any of these views, by a count of a few; views with more than `bound` are
-    drawn in bands (0 = that of the CPU kernels, or of a GPU's memory)."""
+    """Estimate the most fragments at once of any of these views, by a count of a few; larger views than `bound` (0 =
+    that of the CPU kernels, or of a GPU's memory) are drawn in bands."""
     p, most = scene.surfels, 0
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
@@ -145,7 +145,6 @@ def _per_fragment(scene: Scene, of_gpu: float) -> float:
 
 
 def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
-    """Count pixels of the largest view, and of all views."""
     sizes = [camera.width * camera.height for camera in cameras]
     return max(sizes), sum(sizes)
 

@@ -40,7 +40,6 @@ def image_metrics(
 
 
 def _similarity(image: Tensor, reference: Tensor, mask: Tensor | None, distances: Sequence[str]) -> dict[str, float]:
-    """Measure psnr, ssim, and available distances (names of `LPIPS`)."""
     from torchmetrics.functional.image import structural_similarity_index_measure
 
     first, second = (x.permute(2, 0, 1)[None] for x in (image, reference))
@@ -63,8 +62,8 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
 
 
 def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dict[str, float]:
-    """Measure distances by names in `LPIPS`, without those of missing weights, with one warning per process; empty for
-    images of fewer than 32 pixels along a side."""
+    """Measure distances by names in `LPIPS` that have weights; empty for images of fewer than 32 pixels along a
+    side."""
     found: dict[str, float] = {}
     for name in names if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():
         if name in _lpips_missing:  # fetched together: the next one is missing, too

@@ -88,7 +88,6 @@ class BitymiModel(SurfelModel):
 
     @property
     def background(self) -> Tensor:
-        """Colour [3] behind the scene, see `eval_background`."""
         color = eval_background(self.train_config, self.device)
         return torch.zeros(3, device=self.device) if color is None else color
 
@@ -113,7 +112,6 @@ class BitymiModel(SurfelModel):
 
     @property
     def seconds_left(self) -> float | None:
-        """Seconds to the end of a run; None if they are not known."""
         return None if self.run is None else self.run.forecast.left
 
     def sizes(self) -> dict[str, float]:

@@ -49,7 +49,6 @@ def leave_out_photographs(command: Any) -> bool:
 
 
 def check_evaluation(command: Any) -> None:
-    """Stop at paths of ns-eval that cannot be written."""
     path, folder = command.output_path, command.render_output_path
     if path.suffix != ".json":
         fail(f"--output-path must end in .json, {path} does not.")
@@ -120,7 +119,6 @@ def _check_planes(near: float, far: float) -> None:
 
 
 def _check_outputs(command: Any, transparency: bool) -> None:
-    """Stop at outputs that the format cannot hold."""
     names = command.rendered_output_names
     if names is None:  # all of a dataset
         return
@@ -225,8 +223,7 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds
 def _picture(
     model: SurfelModel, camera: Any, names: Sequence[str], planes: dict[str, float], options: Any
 ) -> tuple[np.ndarray, bool]:
-    """Draw a camera's outputs side by side in nerfstudio's colours [H, W, 3 or 4] uint8, and whether the scene
-    shows."""
+    """Draw outputs side by side in nerfstudio's colours [H, W, 3 or 4] uint8, and whether the scene shows."""
     outputs = model.outputs_of(camera, maps=not WITHOUT_MAPS.issuperset(names))
     outputs["rgba"] = model.get_rgba_image(outputs)
     parts = []

@@ -16,8 +16,7 @@ POSES = "poses"  # subfolder of poses that this package found, and their report
 
 
 def take(folder: Path) -> None:
-    """Make the folder, hold it until `leave` or the end of the process, and remove unfinished files of killed runs.
-    Raises InputError: another process trains into it, or it cannot be written."""
+    """Make the folder, hold it until `leave` or the end of the process, and remove unfinished files of killed runs."""
     with files.write_errors_as(folder, InputError, " (--output-dir)."):
         folder.mkdir(parents=True, exist_ok=True)
         try:
@@ -40,7 +39,6 @@ def check_unused(folder: Path, checkpoints: Path) -> None:
 
 
 def leave(folder: Path) -> None:
-    """Let other processes train into the folder."""
     locks.release(folder / LOCK)
 
 

@@ -80,7 +80,6 @@ class SurfelModel(Model):
         return self if device is None else super().to(kernel_device(device))
 
     def get_outputs(self, ray_bundle: Any) -> dict[str, Any]:
-        """Render nerfstudio's cameras; see `outputs_of`."""
         if not isinstance(ray_bundle, Cameras):
             raise TypeError("this model renders cameras, not bundles of rays")
         return self.outputs_of(to_camera(ray_bundle, self.device), maps=True)

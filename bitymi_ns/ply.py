@@ -1,9 +1,9 @@
-"""Reader of PLY files, binary or text: header, and the rows of an element; writer of points. plyfile is not used: it is
-under the GPL, and allocates memory for as many rows of text as a header claims."""
+"""Reader of PLY files, binary or text: header, and the rows of an element; writer of binary ones. plyfile is not used:
+it is under the GPL, and allocates memory for as many rows of text as a header claims."""
 
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from io import TextIOWrapper
@@ -155,11 +155,73 @@ def text_lines(path: Path, header: Header, name: str) -> Iterator[tuple[int, str
         yield from islice(filled, header.ahead(name), None)
 
 
+def write_ply(
+    path: str | Path,
+    columns: Mapping[str, npt.NDArray],
+    comments: Sequence[str] = (),
+    more: Mapping[str, Mapping[str, npt.NDArray]] | None = None,
+) -> None:
+    """Write columns [N] as properties of `vertex`, binary little-endian, in order: uint8 as `uchar`, other integers as
+    `int`, others as `float`. `comments`: lines of the header. `more`: columns of further elements by name, in order."""
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    body = []
+    for element, properties in {"vertex": columns, **(more or {})}.items():
+        count = {len(column) for column in properties.values()}
+        if len(count) != 1:
+            raise PlyError(f"the columns of a PLY element need one length, not {sorted(count)}")
+        kinds = {name: _kind_of(column.dtype) for name, column in properties.items()}
+        rows = np.empty(count.pop(), [(name, f"<{_TYPES[kind]}") for name, kind in kinds.items()])
+        for name, column in properties.items():
+            rows[name] = column
+        header += [f"element {element} {len(rows)}", *(f"property {kind} {name}" for name, kind in kinds.items())]
+        body.append(rows)
+    with open(path, "wb") as file:
+        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
+        for rows in body:
+            file.write(rows.tobytes())
+
+
+def _kind_of(dtype: np.dtype) -> str:
+    return "uchar" if dtype == np.uint8 else "int" if np.issubdtype(dtype, np.integer) else "float"
+
+
 def write_cloud(path: Path, points: npt.NDArray, colors: npt.NDArray) -> None:
-    """Write points [n, 3] with colors [n, 3] as binary little-endian PLY."""
-    rows = np.empty(len(points), [("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    rows["xyz"], rows["rgb"] = points, colors
-    names = ["float x", "float y", "float z", "uchar red", "uchar green", "uchar blue"]
-    properties = "".join(f"property {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(rows)}\n{properties}end_header\n"
-    path.write_bytes(header.encode("ascii") + rows.tobytes())
+    """Write points [n, 3] with colors [n, 3] uint8."""
+    names = zip(("x", "y", "z", "red", "green", "blue"), (*points.T, *colors.astype(np.uint8).T), strict=True)
+    write_ply(path, dict(names))
+
+
+def header_of(data: bytes | bytearray, size: int) -> Header:
+    """Parse the header in the first `HEADER_LIMIT` bytes of a bundle's file of `size` bytes. Raises PlyError: not
+    binary little-endian, `vertex` is not first, a property is not float or int, or the size does not match."""
+    header = parse_header(data)
+    if header.order != "<":
+        raise PlyError("not a binary little-endian PLY file of version 1.0")
+    if next(iter(header.elements), "") != "vertex" or not all(e.names for e in header.elements.values()):
+        raise PlyError("the PLY header declares no vertices, or an element without properties")
+    total = header.start
+    for name, element in header.elements.items():
+        kinds = {element.row[column] for column in element.names} if element.row is not None else {None}
+        if not kinds <= {np.dtype("<f4"), np.dtype("<i4")}:
+            raise PlyError(f"the element {name} has properties that are not float or int")
+        total += element.count * (element.row.itemsize if element.row is not None else 0)
+    if total != size:
+        counts = ", ".join(f"{element.count} of {name}" for name, element in header.elements.items())
+        raise PlyError(f"truncated or too long: {counts} need {total} bytes, the file has {size}")
+    return header
+
+
+def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
+    """Parse a whole file: element to name to [N] float32 or int32 array, in the file's order; the first element is
+    `vertex`. Raises PlyError: as `header_of`, or a value is not finite."""
+    header = header_of(data, len(data))
+    elements, at = {}, header.start
+    for element, declared in header.elements.items():
+        rows = np.frombuffer(data, dtype=declared.row, count=declared.count, offset=at)
+        at += rows.nbytes
+        elements[element] = {name: np.ascontiguousarray(rows[name]) for name in declared.names}
+        for name, column in elements[element].items():
+            bad = ~np.isfinite(column)
+            if bad.any():
+                raise PlyError(f"{name} is not finite in row {int(np.flatnonzero(bad)[0])}")
+    return elements

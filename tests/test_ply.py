@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bundle.ply import write_ply
-from bitymi_ns.ply import PlyError, parse_header, read_header, read_rows
+from bitymi_ns.ply import PlyError, parse_header, read_header, read_rows, write_ply
 
 HEADER = (
     "ply\nformat {} 1.0\ncomment Création\nobj_info by a test\nelement camera 2\nproperty double f\n"

@@ -192,12 +192,12 @@ def compacted(
     else:
         added = coder.allowed(options.share) - coder.error
         chosen, _ = _search(coder, lambda point: (point.error - coder.error) / added, progress, most=MAX_LAMBDA)
-    baked = chosen.baked
+    rounded = chosen.baked
     if options.most_bytes is not None:
-        baked = replace(baked, most_bytes=options.most_bytes - baked.codes.nbytes(), fill=chosen.error > enough)
+        rounded = replace(rounded, most_bytes=options.most_bytes - rounded.codes.nbytes(), fill=chosen.error > enough)
     mse = max(0.0, chosen.error - coder.error) if coder.measured else None
-    rounding = Rounding(mse=mse, steps=dict(baked.codes.steps), alternatives=_alternatives(coder, chosen))
-    return baked.stating(rounding=rounding, view_color=_thinned(baked))
+    rounding = Rounding(mse=mse, steps=dict(rounded.codes.steps), alternatives=_alternatives(coder, chosen))
+    return rounded.stating(rounding=rounding, view_color=_thinned(rounded))
 
 
 def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | None]] | None:

@@ -19,7 +19,6 @@ from bitymi_ns.bake.tile_errors import certified
 from bitymi_ns.bake.tiles import Tiles
 from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.bundle.statistics import KeptTexels
 from bitymi_ns.codec.pages import joined
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
@@ -52,11 +51,10 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Trained:
         tiles = Tiles(none, torch.full((count,), options.extent), torch.zeros(count, 3))
     drawn = {"near": scene.near, "weight_bound": scene.config.weight_bound}
     baked = BakedScene(surfels, kind_of(scene.surfels), torch.zeros(0, 5, dtype=torch.int32), **drawn)
-    own = {"rows": rows, "device": device, "trained": trained, "left_out": left_out}
-    stage = Trained(**own, **laid_out(baked, tiles, options), options=options)
-    if isinstance(scene.field, TexelField):
-        stage = stage.stating(texels=KeptTexels(learned=stage.packing.texels))
-    return stage
+    own = {"rows": rows, "device": device, "trained": trained, "left_out": left_out, "options": options}
+    stage = Trained(**own, **laid_out(baked, tiles, options), texel_counts={})
+    learned = isinstance(scene.field, TexelField)
+    return replace(stage, texel_counts={"learned": stage.packing.texels}) if learned else stage
 
 
 FEWEST_PASSES = 4  # steps of polish or fine-tuning per photograph; more may gain where there are fewer

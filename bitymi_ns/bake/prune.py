@@ -11,7 +11,7 @@ from bitymi_ns.bake.inputs import BakeInput, photo_resolution
 from bitymi_ns.bake.stages import Reduced, Trained
 from bitymi_ns.bake.tiles import Tiles, reduced_tiles
 from bitymi_ns.bake.view_colors import reduce_view_colors
-from bitymi_ns.bundle.statistics import KeptSurfels, LeftOut
+from bitymi_ns.bundle.statistics import KeptSurfels, KeptTexels, LeftOut
 from bitymi_ns.codec.limits import within
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.parameters import Tensors
@@ -78,7 +78,10 @@ def prune_and_resample(baked: Trained, cameras: Sequence[Camera], progress: Prog
         left_out=LeftOut(**result.left_out),
         without_tile=int((result.packing.tiles[:, 3] == 0).sum()),
     )
-    texels = result.statistics.texels
+    texels = dict(result.texel_counts)
+    if texels:
+        texels["kept"] = result.packing.texels
+    result = replace(result, texel_counts=texels)
     return result.become(Reduced, scene=scene, in_front=in_front, colors=colors).stating(
-        surfels=counts, view_color=view_color, texels=texels and texels.replace(kept=result.packing.texels)
+        surfels=counts, view_color=view_color, texels=KeptTexels(**texels) if texels else None
     )

@@ -72,6 +72,9 @@ class Stage:
     texels: Tensor
     options: BakeOptions
     device: torch.device  # of the trained scene: does the work
+    trained: int  # surfels of the scene
+    left_out: Counter[str]  # numbers of those that are not here, by field of `LeftOut`
+    texel_counts: Mapping[str, int]  # by field of `KeptTexels`, those of the scene's kind of texture; empty without one
     statistics: Statistics = field(default_factory=Statistics)
 
     @property
@@ -115,9 +118,6 @@ class Stage:
 @dataclass(frozen=True, kw_only=True)
 class Trained(Stage):
     """Surfels with all terms of their view colours, and tiles as they were trained or read from a field."""
-
-    trained: int  # surfels of the scene
-    left_out: Counter[str]  # numbers of those that are not here, by field of `LeftOut`
 
     def with_surfels(self, surfels: Mapping[str, Tensor]) -> Trained:
         given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Any
 
 import torch
 from pydantic import NonNegativeInt
@@ -16,7 +16,6 @@ from bitymi_ns.bake.stages import Coded, Reduced, Rounded, encoded_texels
 from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.pages import first_texels, listed_texels
-from bitymi_ns.codec.quantise import EncodedAtlas
 from bitymi_ns.codec.texel_codes import TexelCoder, TexelCodes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
@@ -28,32 +27,21 @@ TO_START = 0.93  # share of the byte limit for coded texels before the last step
 TO_FILL = 0.99  # share of the byte limit that the last steps aim at, where it is to be used up
 
 
-F = TypeVar("F", EncodedAtlas, TexelCodes)
-
-
 @dataclass(frozen=True)
-class StoredTexels(Generic[F]):
+class StoredTexels:
     listed: Tensor  # [T, 3] what was coded
     texels: Tensor  # [T, 3] as they are drawn
-    stored: F
-
-
-class TexelCoding(Protocol[F]):
-    """`Cosines` or `Pages`."""
-
-    def first(self, texels: Tensor) -> StoredTexels[F]: ...
-    def again(self, texels: Tensor) -> StoredTexels[F]: ...
-    def last(self, best: StoredTexels[F]) -> StoredTexels[F]: ...
+    stored: Any  # `TexelCodes` of `Cosines`, `EncodedAtlas` of `Pages`
 
 
 class Cosines:
     """Coder of texels for a compact bundle, within the limit of bytes of its coding."""
 
     def __init__(self, baked: Rounded, weights: Tensor) -> None:
-        self._baked, self._most, self._fill = baked, baked.most_bytes, baked.fill
+        self._most, self._fill = baked.most_bytes, baked.fill
         self._coder = TexelCoder(baked.sizes, weights, baked.step, baked.alpha_codes)
 
-    def first(self, texels: Tensor) -> StoredTexels[TexelCodes]:
+    def first(self, texels: Tensor) -> StoredTexels:
         """Code the initial texels [T, 3]."""
         if self._most is None:
             return self._coded(texels, self._coder.code(texels))
@@ -61,19 +49,19 @@ class Cosines:
             self._coder.aim(self._coder.code(texels), self._most * TO_START)
         return self._coded(texels, self._coder.fit(texels, self._most * TO_START))
 
-    def again(self, texels: Tensor) -> StoredTexels[TexelCodes]:
+    def again(self, texels: Tensor) -> StoredTexels:
         codes = self._coder.code(texels, rounds=0)
         if self._fill and self._most is not None:
             self._coder.aim(codes, self._most * TO_FILL)
         return self._coded(texels, codes)
 
-    def last(self, best: StoredTexels[TexelCodes]) -> StoredTexels[TexelCodes]:
+    def last(self, best: StoredTexels) -> StoredTexels:
         """Return the best codes, coded again if they exceed the limit."""
         if self._most is None or best.stored.nbytes() <= self._most:
             return best
         return self._coded(best.listed, self._coder.fit(best.texels, self._most, rounds=1))
 
-    def _coded(self, texels: Tensor, codes: TexelCodes) -> StoredTexels[TexelCodes]:
+    def _coded(self, texels: Tensor, codes: TexelCodes) -> StoredTexels:
         return StoredTexels(texels.clone(), codes.texels_of(self._coder.blocks), codes)
 
 
@@ -83,14 +71,14 @@ class Pages:
     def __init__(self, baked: Reduced) -> None:
         self._baked, self._range = baked, None
 
-    def first(self, texels: Tensor) -> StoredTexels[EncodedAtlas]:
+    def first(self, texels: Tensor) -> StoredTexels:
         """Encode the initial texels, see `Cosines.first`."""
         self._range = None
         coded = self.again(texels)
         self._range = coded.stored.range
         return coded
 
-    def again(self, texels: Tensor) -> StoredTexels[EncodedAtlas]:
+    def again(self, texels: Tensor) -> StoredTexels:
         """Encode later texels, see `Cosines.again`."""
         baked, packing = self._baked, self._baked.packing
         atlas = encoded_texels(baked.with_alpha(texels), packing, baked.options, value_range=self._range)
@@ -98,7 +86,7 @@ class Pages:
         drawn = listed_texels(torch.from_numpy(atlas.decoded()[..., :3]), packing, constants)
         return StoredTexels(texels.clone(), drawn, atlas)
 
-    def last(self, best: StoredTexels[EncodedAtlas]) -> StoredTexels[EncodedAtlas]:
+    def last(self, best: StoredTexels) -> StoredTexels:
         return best
 
 
@@ -203,7 +191,7 @@ def _coded(
     validation: TuningViews,
     step_size: Tensor,
     texels: Tensor,
-    coding: TexelCoding,
+    coding: Cosines | Pages,
     options: TuneOptions,
     progress: Progress,
 ) -> StoredTexels:

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle import compact, ktx2, ply
+from bitymi_ns import ply
+from bitymi_ns.bundle import compact, ktx2
 from bitymi_ns.bundle.cameras import CapturedCamera, parse_cameras
 from bitymi_ns.bundle.manifest import (
     ATLAS,

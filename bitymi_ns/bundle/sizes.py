@@ -7,7 +7,8 @@ from pathlib import Path
 
 import psutil
 
-from bitymi_ns.bundle import compact, ktx2, ply
+from bitymi_ns import ply
+from bitymi_ns.bundle import compact, ktx2
 from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS, TEXELS, BundleError, Manifest
 from bitymi_ns.bundle.surfel_table import TERMS
 from bitymi_ns.exit_messages import out_of_memory
@@ -25,7 +26,7 @@ def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
     PlyError, Ktx2Error, StreamError: they differ."""
     surfels, atlas = info.surfels, info.atlas
     if name == SURFELS:
-        elements = ply.read_header(head, size).elements
+        elements = ply.header_of(head, size).elements
         count, terms = elements["vertex"].count, elements[TERMS].count if TERMS in elements else None
         if count != surfels.count:
             raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {surfels.count}")

@@ -19,7 +19,6 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.codec.limits import ALPHA_LIMIT, EXTENTS, UNIT_SLACK, beyond, limit_of
 from bitymi_ns.codec.surfel_codes import term_rows
 from bitymi_ns.ops import view_color
@@ -27,6 +26,7 @@ from bitymi_ns.ops.constants import MAX_TERMS, SH_C0, SUPPORT
 from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
 from bitymi_ns.ops.view_color import LEAN, check_lean
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere, kind_of
+from bitymi_ns.ply import PlyError
 from bitymi_ns.scene.baked import BakedScene
 
 FLAT_LOG_SCALE = -31.0

@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from bitymi_ns.bundle import compact, ktx2, ply
+from bitymi_ns import ply
+from bitymi_ns.bundle import compact, ktx2
 from bitymi_ns.bundle.manifest import (
     ACTIVATIONS,
     ATLAS,

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle import ply
+from bitymi_ns import ply
 from bitymi_ns.interchange import harmonics
 from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.interchange.quads import fetch_texels

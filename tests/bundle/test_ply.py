@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from bitymi_ns.bundle.ply import PlyError, parse_ply, write_ply
+from bitymi_ns.ply import PlyError, parse_ply, write_ply
 
 COLUMNS = {
     "x": np.array([1.5, -2.0, 3e30], dtype=np.float32),

@@ -2,7 +2,6 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle.ply import PlyError
 from bitymi_ns.bundle.surfel_table import (
     from_columns,
     mean_view_color,
@@ -11,6 +10,7 @@ from bitymi_ns.bundle.surfel_table import (
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.ops.constants import SH_C0
 from bitymi_ns.ops.view_kinds import kind_of
+from bitymi_ns.ply import PlyError
 from bitymi_ns.scene.baked import BakedScene
 
 KINDS = ["sv", "sh", "sb", "sg"]

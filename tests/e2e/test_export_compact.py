@@ -16,10 +16,10 @@ def test_it_is_the_default_smaller_and_shows_the_same(
     trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "b"
-    run_export(trained, folder, format=None, tolerance=TOLERANCE, finetune_steps=30, interchange=True)
+    run_export(trained, folder, format=None, tolerance=TOLERANCE, finetune_steps=30, interchange=True, target_mb=9.0)
     out = " ".join(capsys.readouterr().out.split())
     assert "MB dct" in out and "per surfel" in out and "surfels within the tolerance" in out
-    assert "with --target-mb, about" in out
+    assert "with --target-mb, about" in out and "MB suffice, of the 9 MB that were asked for" in out
     assert {path.name for path in folder.iterdir()} == {
         "bundle.json", "surfels.bin", "texels.bin", "surfels.ply", "config.yml", "preview.jpg", "cameras.json",
         "poster.webp",

@@ -12,13 +12,13 @@ from PIL import Image
 
 from bitymi_ns import cli
 from bitymi_ns.bundle import Bundle, BundleError, check_files, read_bundle
-from bitymi_ns.bundle.ply import parse_ply
 from bitymi_ns.bundle.read import read_cameras
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.interchange import extras
 from bitymi_ns.interchange.extras import extras_folder, training_cameras, write_extras
 from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.glb import upright
+from bitymi_ns.ply import parse_ply
 from tests.bundle.made import make
 from tests.interchange.glb import read_glb
 

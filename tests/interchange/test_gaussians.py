@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle import ply
+from bitymi_ns import ply
 from bitymi_ns.interchange.gaussians import gaussians_of, write_gaussians
 from bitymi_ns.ops.constants import BETA_MAX
 from tests.interchange.test_surfel_colors import baked

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle.ply import parse_ply
 from bitymi_ns.interchange.gaussians import Gaussians, write_gaussians
+from bitymi_ns.ply import parse_ply
 from tests.opened_elsewhere.node import MODULES, said_by
 from tests.opened_elsewhere.splat import gaussians
 from tests.required import skip_without

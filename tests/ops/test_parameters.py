@@ -15,7 +15,7 @@ row = module.Parameter("gloss", (2,), (5.0,), "log_scales", 0.5, columns=("gloss
 module.GEOMETRY_PARAMETERS["gloss"] = row
 
 import pytest, torch
-from bitymi_ns.bundle.ply import PlyError
+from bitymi_ns.ply import PlyError
 from bitymi_ns.bundle.surfel_table import from_columns, to_columns
 from bitymi_ns.codec.limits import within
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, Misfit, _parameters

@@ -15,9 +15,9 @@ import torch
 
 from bitymi_ns.bundle import BundleError, check_files, read_bundle
 from bitymi_ns.bundle.manifest import parse
-from bitymi_ns.bundle.ply import parse_ply, write_ply
 from bitymi_ns.codec.limits import BRIGHTEST
 from bitymi_ns.measure.stability.scenes import random_scene
+from bitymi_ns.ply import parse_ply, write_ply
 from bitymi_ns.scene import Camera
 from tests.bundle.damage import amend, signed
 from tests.bundle.made import make

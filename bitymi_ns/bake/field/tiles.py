@@ -1,6 +1,7 @@
 """Tiles of a residual field (paper, section Texture Baking): a grid for every surfel, with the field at its texels."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -12,7 +13,6 @@ from bitymi_ns.bake.stages import Trained
 from bitymi_ns.bake.tile_errors import closest_pixels
 from bitymi_ns.bake.tiles import Tiles, grid
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.bundle.statistics import KeptTexels
 from bitymi_ns.codec.pages import listed_tiles
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
@@ -60,7 +60,12 @@ def field_tiles(
     `cameras`: training views, for the cap on tile sizes and for what they see. `pixels_per_texel`: a tile gets at most
     one texel per this number of pixels that its surfel fills in the view that shows most of it; None = as many as field
     and views resolve. Raises ValueError: no surfel is left, or the atlas would be too large."""
-    options, paper = baked.options, _paper_texels(baked, field)
+    options = baked.options
+    means, scales = (baked.scene.surfels[name].to(baked.device) for name in ("means", "log_scales"))
+    finest = torch.stack([field.voxel_size(part).amin() for part in means.split(options.chunk)]).amin()
+    # the paper's rule: the smallest voxel size everywhere
+    rates = (scales.exp(), finest.expand(scales.shape), PAPER_EXTENT)
+    paper = _texels(nyquist_resolution(*rates, options.r_min, options.r_max))
     baked, inputs = drop_unseen(baked, cameras, progress)
     sizes, extent, counts = grids(inputs, field, options, pixels_per_texel)
     edges = tangents(inputs.surfels["quats"]) * inputs.surfels["log_scales"].exp()[:, None, :]
@@ -80,16 +85,17 @@ def field_tiles(
     texels[bad] = 0.0
     extent = torch.where(extent > 0, extent, options.extent)
     baked = baked.with_tiles(Tiles(sizes.cpu(), extent.cpu(), texels))
-    polished = None if pixels_per_texel is None else baked.packing.texels
-    counts = counts.replace(paper=paper, polished=polished, kept=baked.packing.texels, not_finite=int(bad.sum()))
-    return baked.stating(texels=counts)
+    counts |= {"paper": paper, "not_finite": int(bad.sum())}
+    if pixels_per_texel is not None:
+        counts["polished"] = baked.packing.texels
+    return replace(baked, texel_counts=counts)
 
 
 def grids(
     inputs: BakeInput, field: Field, options: BakeOptions, pixels_per_texel: float | None
-) -> tuple[Tensor, Tensor, KeptTexels]:
+) -> tuple[Tensor, Tensor, dict[str, int]]:
     """Choose the finest useful grids: sides [N, 2] int32, (0, 0) = none, and half sides [N] in scale units; also count
-    the texels by each rule."""
+    the texels by each rule of `KeptTexels`."""
     surfels = inputs.surfels
     means, scales, axes = surfels["means"], surfels["log_scales"].exp(), tangents(surfels["quats"])
     opacity, beta = kernel_parameters(surfels, inputs.transmittance)
@@ -110,23 +116,11 @@ def grids(
 
     whole = torch.full_like(extent[:, None], options.extent)
     sizes = sides(extent[:, None], pixels)
-    counts = KeptTexels(
-        nyquist=_texels(sides(whole, None)),
-        after_cap_by_views=_texels(sides(whole, pixels)),
-        within_visible_part=_texels(sizes),
-    )
+    by_rule = {"nyquist": sides(whole, None), "after_cap_by_views": sides(whole, pixels), "within_visible_part": sizes}
+    counts = {rule: _texels(chosen) for rule, chosen in by_rule.items()}
     if pixels_per_texel is not None and inputs.views is not None:
         sizes = coarsened(sizes, inputs.views.pixels / pixels_per_texel, options.r_min)
     return torch.where(extent[:, None] > 0, sizes, 0), extent, counts
-
-
-def _paper_texels(baked: Trained, field: Field) -> int:
-    """Count the texels by the paper's rule: the smallest voxel size everywhere, and tiles of extent 4."""
-    options = baked.options
-    means, scales = (baked.scene.surfels[name].to(baked.device) for name in ("means", "log_scales"))
-    finest = torch.stack([field.voxel_size(part).amin() for part in means.split(options.chunk)]).amin()
-    rates = (scales.exp(), finest.expand(scales.shape), PAPER_EXTENT)
-    return _texels(nyquist_resolution(*rates, options.r_min, options.r_max))
 
 
 def _texels(sizes: Tensor) -> int:

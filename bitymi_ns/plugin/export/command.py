@@ -13,9 +13,7 @@ from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.pipeline import FEWEST_PASSES
 from bitymi_ns.bundle import BundleError, reserved_bundle
-from bitymi_ns.bundle.bake_options import BundleFormat
 from bitymi_ns.bundle.parts import CONFIG
-from bitymi_ns.bundle.read import download_bytes
 from bitymi_ns.interchange.extras import (
     Frame,
     Kind,
@@ -35,54 +33,9 @@ from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 
-_MUCH_SMALLER = 0.9
-
 
 @dataclass(kw_only=True)
-class CompactOptions:
-    """Size and quality of a compact bundle."""
-
-    interchange: bool = False  # Write surfels.ply into a compact bundle, too; bundles of other formats have it.
-    compact_error: float = Compact.share
-    """Share by which compacting may raise the mean square error against the training photographs, before texels are
-    tuned; less if texels would become too coarse to learn. Surfels, view colours and texels share the bytes by gain."""
-    target_mb: float | None = None
-    """Largest size of a compact bundle in MB (10^6 bytes), instead of compact_error; smaller if that shows the
-    photographs as well, to 0.01 dB."""
-    target_psnr: float | None = None
-    """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: the smallest
-    bundle that reaches it. Held-out views reach less."""
-
-    def check_compact(self, form: BundleFormat) -> None:
-        compact = form == "compact"
-        for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
-            if not compact and getattr(self, name) != getattr(CompactOptions, name):
-                fail(f"--{name.replace('_', '-')} is for --format compact, and this bundle's is {form}")
-        self.compact_of(0)
-        if self.target_psnr is not None and not 1 <= self.target_psnr <= 100:
-            fail(f"--target-psnr must be from 1 to 100 dB, not {self.target_psnr}")
-        if self.target_mb is not None and self.target_psnr is not None:
-            fail("--target-mb and --target-psnr cannot be asked for together: leave one out")
-        if not 0 < self.compact_error < 1:
-            fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
-
-    def print_size(self, written: int) -> None:
-        """Report a bundle much smaller than --target-mb."""
-        if self.target_mb is not None and written < _MUCH_SMALLER * 1e6 * self.target_mb:
-            more = "with more, the training photographs are shown no better by 0.01 dB."
-            say(f"{written / 1e6:.2f} MB suffice, of the {self.target_mb:g} MB that were asked for: {more}")
-
-    def compact_of(self, beside: int) -> Compact:
-        """Build the options of the compact bake; `beside`: bytes of the bundle's other files, such as the preview."""
-        compact = Compact(self.compact_error, psnr=self.target_psnr)
-        try:
-            return compact if self.target_mb is None else compact.fitting(self.target_mb, beside)
-        except ValueError as error:
-            fail(f"{error}; correct --target-mb", error)
-
-
-@dataclass(kw_only=True)
-class ExportAtlas(BakeOptions, CompactOptions):
+class ExportAtlas(BakeOptions):
     """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest.
 
     Writes the bundle aside, renames and opens it, and compares it with the trained scene and the photographs on the
@@ -113,6 +66,16 @@ class ExportAtlas(BakeOptions, CompactOptions):
     check_room: bool = True
     """Stop if the disk may have too little room, by an estimate that can be many times too high."""
     photographs: bool = False  # Put the held-out photographs into the bundle, for viewers to show beside renders.
+    interchange: bool = False  # Write surfels.ply into a compact bundle, too; bundles of other formats have it.
+    compact_error: float = Compact.share
+    """Share by which compacting may raise the mean square error against the training photographs, before texels are
+    tuned; less if texels would become too coarse to learn. Surfels, view colours and texels share the bytes by gain."""
+    target_mb: float | None = None
+    """Largest size of a compact bundle in MB (10^6 bytes), instead of compact_error; smaller if that shows the
+    photographs as well, to 0.01 dB."""
+    target_psnr: float | None = None
+    """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: the smallest
+    bundle that reaches it. Held-out views reach less."""
 
     def main(self) -> None:
         exit_messages.install()
@@ -140,18 +103,36 @@ class ExportAtlas(BakeOptions, CompactOptions):
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
-        if self.finetune_steps is not None and self.finetune_steps < 0:
-            fail(f"--finetune-steps must not be negative, it is {self.finetune_steps}; 0 = no fine-tuning")
-        if self.polish_steps is not None and self.polish_steps < 0:
-            fail(f"--polish-steps must not be negative, it is {self.polish_steps}; 0 = no polish")
+        for name, what in (("finetune", "fine-tuning"), ("polish", "polish")):
+            steps = getattr(self, f"{name}_steps")
+            if steps is not None and steps < 0:
+                fail(f"--{name}-steps must not be negative, it is {steps}; 0 = no {what}")
         if not 0 <= self.finetune_memory <= 1e6:
             fail(f"--finetune-memory must be from 0 to 1,000,000 GB, not {self.finetune_memory}")
         try:
             options.check()
         except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
             fail(f"the scene cannot be baked: {error}", error)
-        self.check_compact(options.bundle_format)
+        for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
+            if options.bundle_format != "compact" and getattr(self, name) != getattr(ExportAtlas, name):
+                form = f"--format compact, and this bundle's is {options.bundle_format}"
+                fail(f"--{name.replace('_', '-')} is for {form}")
+        self._compact(0)
+        if self.target_psnr is not None and not 1 <= self.target_psnr <= 100:
+            fail(f"--target-psnr must be from 1 to 100 dB, not {self.target_psnr}")
+        if self.target_mb is not None and self.target_psnr is not None:
+            fail("--target-mb and --target-psnr cannot be asked for together: leave one out")
+        if not 0 < self.compact_error < 1:
+            fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
         return options
+
+    def _compact(self, beside: int) -> Compact:
+        """Build the options of the compact bake; `beside`: bytes of the bundle's other files, such as the preview."""
+        compact = Compact(self.compact_error, psnr=self.target_psnr)
+        try:
+            return compact if self.target_mb is None else compact.fitting(self.target_mb, beside)
+        except ValueError as error:
+            fail(f"{error}; correct --target-mb", error)
 
     def _run(self, options: BakeOptions) -> None:
         config, pipeline = load_trained(self.load_config)
@@ -163,7 +144,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         exposure = model.resume_state.get("exposure")
         cameras_of = camera_files(datamanager, views, self.photographs, exposure)
         beside = len(shown) + sum(map(len, cameras_of.values()))
-        compacting = self.compact_of(beside) if compact else None
+        compacting = self._compact(beside) if compact else None
         refine, memory = RefineOptions(), int(self.finetune_memory * 1e9)
         if not self.exact:
             steps = (self.polish_steps, self.finetune_steps, memory)
@@ -171,8 +152,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
         polish, tune, has_learned = refine.polish, refine.tune, isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
-                passes = options_of.steps / len(views)
-                each = f"{len(views):,} training photographs, {passes:.1f} for each"
+                each = f"{len(views):,} training photographs, {options_of.steps / len(views):.1f} for each"
                 say(f"The {name} has {options_of.steps:,} steps for {each}: more may gain (--{name}-steps).")
         kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
         state_export(model.scene, views, kept, learning_surfels, compact)
@@ -199,8 +179,7 @@ class ExportAtlas(BakeOptions, CompactOptions):
                 written["statistics"]["held_out"] = compare(model, datamanager, baked.scene).model_dump()
         finally:  # a comparison that is interrupted leaves the bundle, without its result
             bundle = export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
-        print_summary(self.output_dir, bundle.info)
-        self.print_size(download_bytes(self.output_dir, bundle.info))
+        print_summary(self.output_dir, baked, bundle.info, self.target_mb)
         if self.extras:
             folder = extras_folder(self.output_dir)
             how = {"frame": self.extras_frame, "overwrite": self.overwrite}

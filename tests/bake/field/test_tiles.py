@@ -19,7 +19,7 @@ def test_tiles_without_a_tolerance_hold_the_field_at_every_texel_centre(scene) -
     baked = field_tiles(trained_texels(made, options), Positions(), ())
     params, done = made.surfels, 0
     axes, scales = tangents(params["quats"]), params["log_scales"].exp()
-    bad = baked.statistics.texels.not_finite
+    bad = baked.texel_counts["not_finite"]
     assert bad > 0 and baked.extent.tolist() == [3.0] * 40
     for i, (r_u, r_v) in enumerate(baked.sizes.tolist()):
         found = baked.texels[done : done + r_u * r_v].view(r_v, r_u, 3)

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle import BundleError, check_files, ply, read, read_bundle, sizes
+from bitymi_ns import ply
+from bitymi_ns.bundle import BundleError, check_files, read, read_bundle, sizes
 from bitymi_ns.bundle.manifest import EARLIER
 from bitymi_ns.bundle.read import read_manifest
 from bitymi_ns.bundle.sizes import least_memory

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bitymi_ns.bundle import ktx2, ply, strict_json
+from bitymi_ns import ply
+from bitymi_ns.bundle import ktx2, strict_json
 from bitymi_ns.codec.streams import compress, decompress
 
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle import BundleError, World, ktx2, ply, read_bundle
+from bitymi_ns import ply
+from bitymi_ns.bundle import BundleError, World, ktx2, read_bundle
 from bitymi_ns.bundle import write as bundle_module
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.ops.reference import view_color as reference

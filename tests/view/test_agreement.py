@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bitymi_ns.bundle import BundleError, ktx2, ply, read_bundle
+from bitymi_ns import ply
+from bitymi_ns.bundle import BundleError, ktx2, read_bundle
 from bitymi_ns.codec.streams import compress
 from bitymi_ns.view import site_of
 from tests.bundle.damage import amend

@@ -18,6 +18,7 @@ from bitymi_ns.trust import json_of, no_links
 
 FILE = "cells.jsonl"
 NAMES = ("suite", "row")  # entries of a key that are labels, not part of its identity
+NOT_OF_A_RUN = ("cell", "bundle", "export")  # entries of a key in which the cells of a run differ
 
 
 def identity(key: dict[str, Any], *without: str) -> str:
@@ -43,10 +44,7 @@ class Cells:
     """Finished cells of a work folder; several processes may append to the file."""
 
     def __init__(self, path: Path) -> None:
-        """
-        Raises:
-            BenchError: a line is not a cell.
-        """
+        """Raises BenchError: a line is not a cell."""
         self.path = path
         self.refresh()
 

@@ -41,7 +41,7 @@ def command_of(work: Path, cell: CellSpec) -> list[str]:
     config, output = ("--load-config", str(work / cell.parent.output / "config.yml")), str(work / cell.output)
     if cell.bundle is not None and cell.kind == "export":
         return [tool("ns-export"), "bitymi-atlas", *config, "--output-dir", output, *cell.bundle.options]
-    pictures = str(work / cell.pictures)
+    pictures = output.removesuffix(".json")
     return [tool("ns-eval"), *config, "--output-path", output, "--render-output-path", pictures]
 
 
@@ -58,7 +58,7 @@ def read_result(work: Path, cell: CellSpec) -> dict[str, Any]:
         if cell.kind == "export":
             return _export(work / cell.output)
         results = read_json(work / cell.output)["results"]
-        return {"results": {**results, "psnr": results["psnr"]}, "pictures": cell.pictures.as_posix()}
+        return {"results": {**results, "psnr": results["psnr"]}, "pictures": cell.output.with_suffix("").as_posix()}
 
 
 def _refuse(message: str, cause: BaseException) -> NoReturn:

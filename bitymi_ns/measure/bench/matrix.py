@@ -1,19 +1,19 @@
 """Benchmark matrix: scenes x rows x seeds, the cells of each run; standard data sets and plans by name."""
 
 import hashlib
-import json
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Annotated, Any, Literal, NoReturn, TypedDict
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.measure.bench.cells import NOT_OF_A_RUN, identity
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 from bitymi_ns.ranges import describe_problems
@@ -64,9 +64,10 @@ class CellSpec:
     bundle: BundleSpec | None = None
 
     @property
-    def run_key(self) -> dict[str, Any]:
-        """All settings that affect the training run."""
-        return {
+    def key(self) -> dict[str, Any]:
+        """All settings that affect the result of the cell."""
+        key: dict[str, Any] = {
+            "cell": self.kind,
             "suite": self.scene.suite,
             "row": self.row.name,
             "scene": self.scene.name,
@@ -77,11 +78,6 @@ class CellSpec:
             "steps": self.steps,
             "seed": self.seed,
         }
-
-    @property
-    def key(self) -> dict[str, Any]:
-        """All settings that affect the result of the cell."""
-        key: dict[str, Any] = {"cell": self.kind, **self.run_key}
         if self.bundle is not None:
             key |= {"bundle": self.bundle.name, "export": list(self.bundle.options)}
         return key
@@ -89,11 +85,9 @@ class CellSpec:
     @property
     def run_name(self) -> str:
         """Folder name of the run, unique among those of a method on a capture."""
-        settings = {k: v for k, v in self.run_key.items() if k not in ("suite", "row")}
-        digest = hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:8]
+        digest = hashlib.sha256(identity(self.key, *NOT_OF_A_RUN).encode()).hexdigest()[:8]
         length = "own-length" if self.steps is None else f"{self.steps}-steps"
-        seed = "" if self.seed is None else f"-seed{self.seed}"
-        return f"{length}{seed}-{digest}"
+        return f"{length}{'' if self.seed is None else f'-seed{self.seed}'}-{digest}"
 
     @property
     def folder(self) -> str:
@@ -107,15 +101,10 @@ class CellSpec:
 
     @property
     def output(self) -> Path:
-        """Path in the work folder of the output: a folder, or the file of an evaluation."""
-        if self.kind == "train":
-            return Path("runs", self.folder)
-        return Path("bundles", self.folder, self.form) if self.kind == "export" else self.pictures.with_suffix(".json")
-
-    @property
-    def pictures(self) -> Path:
-        """Path in the work folder of the pictures of an evaluation."""
-        return Path("evals", self.folder, self.form)
+        """Path in the work folder of the output: a folder, or the file of an evaluation, beside the folder of its
+        pictures."""
+        folders = {"train": Path("runs", self.folder), "export": Path("bundles", self.folder, self.form)}
+        return folders.get(self.kind, Path("evals", self.folder, f"{self.form}.json"))
 
     @property
     def parent(self) -> "CellSpec":
@@ -134,7 +123,7 @@ class CellSpec:
         return f"{self.run}: {what[self.kind]}"
 
 
-Chain = Sequence[CellSpec]  # the cells of one run; each may depend on those before it
+Chain = list[CellSpec]  # the cells of one run; each may depend on those before it
 
 
 def chains(
@@ -146,21 +135,19 @@ def chains(
 ) -> list[Chain]:
     """List the cells of each run in the order of their dependencies: each row is trained on each scene with each seed
     (empty: once, with the method's own), then baked to each bundle."""
-    found: list[Chain] = []
+    listed: list[Chain] = []
     for scene, row, seed in product(scenes, rows, list(seeds) or [None]):
         train = CellSpec(scene, row, seed, steps)
-        chain = [train, replace(train, kind="eval")]
+        listed.append([train, replace(train, kind="eval")])
         for bundle in bundles if row.ours else ():
-            chain += [replace(train, kind="export", bundle=bundle), replace(train, kind="eval", bundle=bundle)]
-        found.append(chain)
-    return found
+            listed[-1] += [replace(train, kind="export", bundle=bundle), replace(train, kind="eval", bundle=bundle)]
+    return listed
 
 
 Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atlas`
 
 
-@dataclass(frozen=True)
-class Suite:
+class Suite(TypedDict):
     """A standard data set, an entry of suites.yaml."""
 
     title: str
@@ -183,8 +170,7 @@ def _refuse(message: str, cause: BaseException) -> NoReturn:
 
 def suites() -> dict[str, Suite]:
     """Read the standard data sets, by name."""
-    entries = _read(Path(__file__).with_name("suites.yaml"))
-    return {name: Suite(**entry) for name, entry in entries.items()}
+    return _read(Path(__file__).with_name("suites.yaml"))
 
 
 def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
@@ -214,20 +200,19 @@ def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[Sce
     """List the scenes of a standard data set. Raises BenchError: a scene does not exist, or its folder lacks required
     files."""
     suite, scenes = suites()[name], []
-    unknown = sorted(set(only) - set(suite.scenes))
+    unknown = sorted(set(only) - set(suite["scenes"]))
     if unknown:
-        raise BenchError(f"{name} has no scene {', '.join(unknown)}; it has {', '.join(suite.scenes)}")
-    for scene in only or suite.scenes:
-        folder, factor = Path(os.path.expanduser(root)).resolve() / scene, suite.scenes[scene]
-        images = "images" if factor == 1 else f"images_{factor}"
-        needed = [part.format(images=images) for part in suite.needed]
+        raise BenchError(f"{name} has no scene {', '.join(unknown)}; it has {', '.join(suite['scenes'])}")
+    for scene in only or suite["scenes"]:
+        folder, factor = Path(os.path.expanduser(root)).resolve() / scene, suite["scenes"][scene]
+        needed = [part.format(images="images" if factor == 1 else f"images_{factor}") for part in suite["needed"]]
         missing = [part for part in needed if not (folder / part).exists()]
         if missing:
             raise BenchError(
-                f"{folder} is not {suite.title}'s {scene}: there is no {' and no '.join(missing)}. --data is the "
+                f"{folder} is not {suite['title']}'s {scene}: there is no {' and no '.join(missing)}. --data is the "
                 f"folder that holds the scenes; --scenes {scene} ... chooses some of them"
             )
-        scenes.append(SceneSpec(scene, folder, name, tuple(suite.parser.format(factor=factor).split())))
+        scenes.append(SceneSpec(scene, folder, name, tuple(suite["parser"].format(factor=factor).split())))
     return scenes
 
 

@@ -105,11 +105,11 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
     sets = list(grouped(folders, lambda f: tuple((i, view.digest) for i, view in folders[f].items())).values())
     if len(sets) > MAX_SETS:
         notes.append(f"Views of {len(sets) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
-    shared = os.path.commonpath(folders) if len(folders) > 1 else ""
+    shared = os.path.commonpath([folder.parent for folder in folders]) if folders else ""
     groups = []
     for members in sets[:MAX_SETS]:
-        names = {os.path.relpath(f, shared) if shared not in ("", str(f)) else f.name: folders[f] for f in members}
-        groups += _compared(dict(sorted(names.items())), len(sets) > 1)
+        names = sorted((os.path.relpath(folder, shared), folders[folder]) for folder in members)
+        groups += _compared(dict(names), len(sets) > 1)
     return groups
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from bitymi_ns.measure.bench.cells import FILE as CELLS
-from bitymi_ns.measure.bench.cells import Cells, identity
+from bitymi_ns.measure.bench.cells import NOT_OF_A_RUN, Cells, identity
 from bitymi_ns.measure.report.pictures import SIDE_BY_SIDE
 from bitymi_ns.measure.report.records import (
     Evaluation,
@@ -26,7 +26,6 @@ MAX_BYTES = 64 << 20  # larger files are not evaluations
 MAX_DEPTH = 8  # levels of folders that are searched
 ADVICE = "Write it again, or leave it out."
 _SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
-_NOT_OF_A_RUN = ("cell", "bundle", "export")
 
 
 def _refuse(message: str, cause: BaseException) -> NoReturn:
@@ -61,9 +60,9 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
     """Add the cells of a benchmark, and the curves and images that they name, if these exist. `cells`: of the file
     `path`. Raises ReportError: a cell lacks an entry that its kind requires."""
     with reading(f"{path}: a cell", _refuse, passing=(ReportError,)):
-        runs = grouped(cells, lambda cell: identity(cell["key"], *_NOT_OF_A_RUN))
+        runs = grouped(cells, lambda cell: identity(cell["key"], *NOT_OF_A_RUN))
         keys = [of_run[0]["key"] for of_run in runs.values()]
-        series = [identity(key, *_NOT_OF_A_RUN, "seed") for key in keys]
+        series = [identity(key, *NOT_OF_A_RUN, "seed") for key in keys]
         seeds = Counter(series)
         names = [(str(key.get("scene", "unnamed scene")), str(key.get("row", "unnamed method"))) for key in keys]
         namesakes = Counter((*name, key.get("seed")) for name, key in zip(names, keys, strict=True))

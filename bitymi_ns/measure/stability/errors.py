@@ -1,13 +1,10 @@
 """Errors of a backend against the float64 reference, and errors caused by rounding the inputs."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -24,9 +21,7 @@ from bitymi_ns.measure.stability.scenes import (
     tiles_of,
 )
 from bitymi_ns.ops.backend import emulated_cuda, module
-from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.project import geometry_of
-from bitymi_ns.ops.reference import extended
 from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.ops.reference.view_color import view_directions
@@ -98,7 +93,7 @@ class _Result:
     leaves: dict[str, Tensor]
     cells: Tensor | None = None  # [P, N] int64, of textured surfels
 
-    def same(self, other: _Result) -> Tensor:
+    def same(self, other: "_Result") -> Tensor:
         """Find the pixels, [P] bool, in which both sum the same terms."""
         alike = self.low_pass == other.low_pass
         if self.cells is not None and other.cells is not None:
@@ -123,29 +118,28 @@ def measure(
         same = got.same(want)
         weights = _loss_weights(want.images)
         grads = _gradients(got, weights, same)
-        everywhere = _gradients(got, weights, torch.ones_like(same), keep=False)
+        everywhere = _gradients(got, weights, torch.ones_like(same))
     wanted = _gradients(want, weights, same)
-    finite = all(bool(t.isfinite().all()) for t in (*got.images.values(), *grads.values(), *everywhere.values()))
     gradient_errors = {key: _relative(grads[key], wanted[key]) for key in wanted}
-    worst = max(gradient_errors, key=lambda key: _order(gradient_errors[key])) if gradient_errors else ""
-    probe_forward, probe_gradient = [0.0], [0.0]
+    worst = max(gradient_errors, key=lambda key: gradient_errors[key])
+    input_forward = input_gradient = 0.0
     generator = torch.Generator().manual_seed(0)
     for _ in range(PROBES):
         moved = _map(rounded, lambda t: t * (1 + ROUNDING[dtype] * _signs(t, generator)))
         other = _by_reference(moved, near, way)
         agree = other.same(want)
-        probe_forward.append(_image_error(other.images, want.images, agree))
+        input_forward = max(input_forward, _image_error(other.images, want.images, agree))
         here, there = (_gradients(result, weights, agree & same) for result in (want, other))
-        probe_gradient += [_relative(there[key], here[key]) for key in here]
+        input_gradient = max(input_gradient, *(_relative(there[key], here[key]) for key in here))
     return Errors(
         forward=_image_error(got.images, want.images, same),
-        gradient=gradient_errors.get(worst, 0.0),
+        gradient=gradient_errors[worst],
         worst=worst,
         flipped=1.0 - same.double().mean().item(),
-        input_forward=max(probe_forward),
-        input_gradient=max(probe_gradient),
+        input_forward=input_forward,
+        input_gradient=input_gradient,
         drawn=int(want.blended.sum()),
-        finite=finite,
+        finite=all(bool(t.isfinite().all()) for t in (*got.images.values(), *grads.values(), *everywhere.values())),
     )
 
 
@@ -204,13 +198,13 @@ def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
     return weights
 
 
-def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor, keep: bool = True) -> dict[str, Tensor]:
+def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor) -> dict[str, Tensor]:
     """Compute d sum(weights * images over `pixels`) / d leaves, float64 on the CPU."""
     leaves = result.leaves
     loss = torch.zeros(())
     for key, image in result.images.items():
         loss = loss + (image * torch.where(pixels[:, None], weights[key], 0.0).to(image)).sum()
-    grads = torch.autograd.grad(loss, list(leaves.values()), retain_graph=keep, allow_unused=True)
+    grads = torch.autograd.grad(loss, list(leaves.values()), retain_graph=True, allow_unused=True)
     return {
         key: torch.zeros_like(leaf, dtype=torch.float64, device="cpu") if grad is None else grad.detach().double().cpu()
         for (key, leaf), grad in zip(leaves.items(), grads, strict=True)
@@ -218,72 +212,14 @@ def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor, keep
 
 
 def _image_error(got: dict[str, Tensor], want: dict[str, Tensor], pixels: Tensor) -> float:
-    return max((_relative(got[key], want[key], pixels) for key in want), key=_order)
+    return max(_relative(got[key], want[key], pixels) for key in want)
 
 
 def _relative(got: Tensor, want: Tensor, rows: Tensor | slice = slice(None)) -> float:
-    """Compute the largest error in `rows`, relative to the largest value of `want` in all rows."""
+    """Compute the largest error in `rows`, relative to the largest value of `want` in all rows; infinite for NaN."""
     want = want.detach()
-    errors = (got.detach().double().cpu() - want).abs()[rows]
+    errors = (got.detach().double().cpu() - want).abs()[rows].nan_to_num(math.inf)
     if not errors.numel():
         return 0.0
     scale, error = want.abs().max().item(), errors.max().item()
     return error / scale if scale > NOTHING else error
-
-
-def _order(error: float) -> float:
-    """Return the sort key of an error: NaN is the largest."""
-    return math.inf if math.isnan(error) else error
-
-
-@dataclass(frozen=True)
-class ExtendedErrors:
-    """Errors against extended precision (`ops.reference.extended`), for scenes where even float64 may be inaccurate."""
-
-    forward: float
-    """Largest error of alpha, depth, normal and Beta map over the pixels where both blend the same surfels."""
-    gradient: float
-    """Largest error of a directional derivative of the loss, in one random direction per geometry parameter, relative
-    to the root of the sum of squares of its terms."""
-
-
-def against_extended(case: SceneCase, backend: Backend | None = None, near: float = 0.2) -> ExtendedErrors:
-    """Measure the float64 reference, or a backend in float64, against extended precision.
-
-    Args:
-        case: scene and camera; rounded to float32 as for `measure`.
-        backend: to measure; None: the reference.
-        near: near plane, camera z.
-    """
-    rounded = _map(case, lambda t: t.float().double())
-    if backend is None:
-        got = _by_reference(rounded, near, replace(PLAIN, rim=0.0))
-    else:
-        with backend.use():
-            got = _by_kernels(rounded, backend.device, torch.float64, near, replace(PLAIN, rim=1e-30))
-    names = ("alpha", "depth", "normal", "beta_map")
-    plain = {key: value.numpy() for key, value in zip(GEOMETRY, geometry_of(rounded.params), strict=True)}
-
-    def run(params: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], extended.Extended]:
-        result = extended.render([params[key] for key in GEOMETRY], rounded, near)
-        arrays = (result.alpha[:, None], result.depth[:, None], result.normal, result.beta[:, None])
-        return dict(zip(names, arrays, strict=True)), result
-
-    images, result = run(plain)
-    same = (result.blended == got.blended.numpy()) & ((result.low_pass == got.low_pass.numpy()) | ~result.blended)
-    same = same.all(1)  # [P]
-    pixels = torch.from_numpy(same)
-    exact = {key: torch.from_numpy(value.real.astype(np.float64)) for key, value in images.items()}
-    forward = _image_error({key: got.images[key] for key in names}, exact, pixels)
-    weights = _loss_weights(exact)
-    grads = _gradients(replace(got, images={key: got.images[key] for key in names}), weights, pixels)
-    rng, worst, step = np.random.default_rng(0), 0.0, np.longdouble(1e-200)
-    for key in GEOMETRY:
-        direction = rng.standard_normal(plain[key].shape)
-        moved, _ = run({**plain, key: plain[key] + 1j * step * direction.astype(np.clongdouble)})
-        terms = [np.where(same[:, None], weights[name].numpy(), 0.0) * moved[name].imag for name in names]
-        slope = float(sum(term.sum() for term in terms) / step)
-        products = grads[key].numpy() * direction
-        size, error = math.sqrt((products**2).sum()), abs(slope - products.sum())
-        worst = max(worst, error / size if size > NOTHING else error, key=_order)
-    return ExtendedErrors(forward, worst)

@@ -13,14 +13,12 @@ from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.figure import panels, png, styled
 from bitymi_ns.measure.markdown import rendered
-from bitymi_ns.measure.stability.errors import PROBES, Backend, Errors, ExtendedErrors, against_extended, measure
+from bitymi_ns.measure.stability.errors import PROBES, Backend, Errors, measure
 from bitymi_ns.measure.stability.scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Way, extreme_scenes
 
 ACCURATE = 1e-4  # largest error that counts as accurate
-STEPS = round(1 / (255 * ACCURATE))  # an 8-bit step in units of ACCURATE
 ALLOWANCE = 4.0  # an error of at most this many times the effect of rounding the inputs is `LIMITED`
-LIMITED = "as the inputs allow"
-EXTENDED_SIZE = 20_000  # maximum of pixels times surfels for extended precision
+LIMITED, NOTHING = "as the inputs allow", "nothing drawn"  # verdicts
 
 
 @dataclass(frozen=True)
@@ -30,17 +28,11 @@ class SceneErrors:
     label: str
     single: Errors  # of the kernels in float32
     double: Errors  # of the kernels in float64
-    trust: ExtendedErrors | None  # of the float64 reference; None: too large a scene, or not `PLAIN`
 
     @property
     def exact(self) -> float:
         """Largest error of images and gradients of the kernels in float64."""
         return max(self.double.forward, self.double.gradient)
-
-    @property
-    def trusted(self) -> float | None:
-        """Largest error of the float64 reference against extended precision; None if the scene is too large for it."""
-        return max(self.trust.forward, self.trust.gradient) if self.trust else None
 
     @property
     def errors(self) -> tuple[float, float, float, float]:
@@ -55,7 +47,7 @@ class SceneErrors:
         if not all(e.finite for e in both):
             return "**not finite**"
         if self.single.drawn == 0:
-            return "nothing drawn"
+            return NOTHING
         pairs = [pair for e in both for pair in ((e.forward, e.input_forward), (e.gradient, e.input_gradient))]
         if all(error <= ACCURATE for error, _ in pairs):
             return "accurate"
@@ -65,11 +57,9 @@ class SceneErrors:
 
 
 def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> SceneErrors:
-    """Measure one scene in float32, float64 and, if it is small enough, extended precision."""
-    size = scene.width * scene.height * len(scene.params["means"])
-    trust = against_extended(scene, near=near) if way is PLAIN and size <= EXTENDED_SIZE else None
-    double = measure(scene, backend, torch.float64, near, way)
-    return SceneErrors(label, measure(scene, backend, torch.float32, near, way), double, trust)
+    """Measure one scene in float32 and float64."""
+    single, double = (measure(scene, backend, dtype, near, way) for dtype in (torch.float32, torch.float64))
+    return SceneErrors(label, single, double)
 
 
 def write(path: Path, backend: Backend, progress: Callable[[str], None]) -> list[SceneErrors]:
@@ -79,12 +69,10 @@ def write(path: Path, backend: Backend, progress: Callable[[str], None]) -> list
         check_writable(target)
     named: dict[str, list[SceneErrors]] = {}
     for way in (PLAIN, *WAYS):
-        named[way.name] = []
-        for scene in extreme_scenes():
-            progress(f"case {scene.name}, {way.name}")
-            row = measure_row(scene.name.replace("_", " "), scene, backend, way=way)
-            if way is PLAIN or row.single.drawn:
-                named[way.name].append(row)
+        progress(f"cases, {way.name}")
+        named[way.name] = [
+            measure_row(scene.name.replace("_", " "), scene, backend, way=way) for scene in extreme_scenes()
+        ]
     swept: dict[str, list[SceneErrors]] = {}
     for sweep in SWEEPS:
         progress(f"sweep {sweep.name}")
@@ -92,56 +80,43 @@ def write(path: Path, backend: Backend, progress: Callable[[str], None]) -> list
             measure_row(f"{value:g}", sweep.make(value), backend, sweep.near(value)) for value in sweep.values
         ]
     rows = [row for rows in (*named.values(), *swept.values()) for row in rows]
+    counts = {"accurate": 0, LIMITED: 0, "loses figures": 0, **Counter(row.verdict.strip("*") for row in rows)}
     text = rendered(
         "stability.md.j2",
         backend=backend.name,
         rim=f"{RIM:g}",
         probes=PROBES,
         accurate=f"{ACCURATE:g}",
-        steps=STEPS,
+        steps=round(1 / (255 * ACCURATE)),
         allowance=f"{ALLOWANCE:g}",
         picture=picture.name,
         sweeps=_sweeps(swept),
-        cases=_inexact([row for row in named[PLAIN.name] if row.verdict != "nothing drawn"]),
-        others={way.name: _inexact(named[way.name]) for way in WAYS},
-        verdicts=_verdicts(rows),
-        nothing=", ".join(row.label for row in named[PLAIN.name] if row.verdict == "nothing drawn"),
+        cases={name: _inexact([row for row in of_way if row.verdict != NOTHING]) for name, of_way in named.items()},
+        verdicts=", ".join(f"{count} {verdict}" for verdict, count in counts.items() if verdict != NOTHING),
+        nothing=", ".join(row.label for row in named[PLAIN.name] if row.verdict == NOTHING),
     )
     write_file(picture, _plot(swept), follow=True)
     write_file(path, text.encode(), follow=True)
     return rows
 
 
-CASES = ("case", "forward", "inputs", "gradient", "inputs", "worst in", "flipped", "float64", "reference", "verdict")
-SWEPT = ("kind", "values", "forward", "inputs", "gradient", "inputs", "float64", "reference", "not accurate at")
-
-
-def _cases(rows: Sequence[SceneErrors]) -> str:
-    """Format a table of one line per scene."""
-    lines = []
-    for row in rows:
-        e = row.single
-        flipped = f"{100 * e.flipped:.2g} %" if e.flipped else "0"
-        worst, exact = e.worst if e.gradient else "", [_short(row.exact), _short(row.trusted)]
-        lines.append([row.label, *map(_short, row.errors), worst, flipped, *exact, row.verdict])
-    return markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
+CASES = ("case", "forward", "inputs", "gradient", "inputs", "worst in", "flipped", "float64", "verdict")
+SWEPT = ("kind", "values", "forward", "inputs", "gradient", "inputs", "float64", "not accurate at")
 
 
 def _inexact(rows: Sequence[SceneErrors]) -> str:
     """Summarise the accurate cases with their largest errors, then format a line for each other case."""
     accurate = [row for row in rows if row.verdict == "accurate"]
-    images, gradients = (max((row.errors[i] for row in accurate), default=0.0) for i in (0, 2))
-    count = f"{len(accurate)} of {len(rows)} cases are accurate: images within {_short(images)}, gradients within"
-    others = [row for row in rows if row not in accurate]
-    return f"{count} {_short(gradients)}." + (f" The others:\n\n{_cases(others)}" if others else "")
-
-
-def _verdicts(rows: Sequence[SceneErrors]) -> str:
-    """Count rows by verdict, without those that draw nothing; "loses figures" is listed even if 0."""
-    counts = Counter(row.verdict.strip("*") for row in rows if row.single.drawn)
-    return ", ".join(
-        f"{counts[name]} {name}" for name in dict.fromkeys(["accurate", LIMITED, "loses figures", *counts])
-    )
+    images, gradients = (_short(max((row.errors[i] for row in accurate), default=0.0)) for i in (0, 2))
+    text = f"{len(accurate)} of {len(rows)} cases are accurate: images within {images}, gradients within {gradients}."
+    lines = []
+    for row in rows:
+        if row.verdict != "accurate":
+            worst = row.single.worst if row.single.gradient else ""
+            flipped = f"{100 * row.single.flipped:.2g} %"
+            lines.append([row.label, *map(_short, row.errors), worst, flipped, _short(row.exact), row.verdict])
+    table = markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
+    return f"{text} The others:\n\n{table}" if lines else text
 
 
 def _sweeps(swept: Mapping[str, Sequence[SceneErrors]]) -> str:
@@ -149,19 +124,16 @@ def _sweeps(swept: Mapping[str, Sequence[SceneErrors]]) -> str:
     lines = []
     for sweep in SWEEPS:
         rows = swept[sweep.name]
-        errors = map(max, zip(*((*row.errors, row.exact, row.trusted or 0.0) for row in rows), strict=True))
-        inexact = [
-            f"{row.label}{'' if row.verdict == LIMITED else f' ({row.verdict})'}"
-            for row in rows
-            if row.verdict != "accurate"
-        ]
+        errors = map(max, zip(*((*row.errors, row.exact) for row in rows), strict=True))
+        labels = {LIMITED: "{0.label}", "accurate": ""}
+        inexact = filter(None, (labels.get(row.verdict, "{0.label} ({0.verdict})").format(row) for row in rows))
         values = f"{rows[0].label} to {rows[-1].label}"
         lines.append([sweep.axis, values, *map(_short, errors), ", ".join(inexact) or "-"])
     return markdown.table(SWEPT, lines, (0, 1, len(SWEPT) - 1))
 
 
-def _short(value: float | None) -> str:
-    return "-" if value is None else "0" if value == 0 else f"{value:.1e}"
+def _short(value: float) -> str:
+    return f"{value:.1e}" if value else "0"
 
 
 FORWARD, GRADIENT, DOUBLE = "#0b62b8", "#d1540b", "#6b6f76"

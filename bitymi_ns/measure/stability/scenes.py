@@ -161,8 +161,8 @@ def decades(first: int, last: int) -> tuple[float, ...]:
     return tuple(10.0**k for k in range(first, last + step, step))
 
 
-def _small(seed: int, n: int = 16, scale: float = 0.25) -> SceneCase:
-    return front_scene(n, seed, 24, 16, scale=scale)
+def _small(seed: int, scale: float = 0.25) -> SceneCase:
+    return front_scene(16, seed, scale=scale)
 
 
 def _edge_on(angle: float) -> SceneCase:
@@ -174,17 +174,16 @@ def _edge_on(angle: float) -> SceneCase:
     return changed(base, quats=quaternions(rotation))
 
 
-def _near_plane(depth: float) -> SceneCase:
-    """Build discs of scale 0.5 with centres at 0.5 to 1.5 times this depth."""
+def _camera_plane(depth: float) -> SceneCase:
+    """Build discs of scale 0.5 with centres at 0.5 to 1.5 times this depth, in scales."""
     base = _small(1, scale=0.5)
-    return changed(base, means=base.params["means"] * (depth / 4.0))
+    return changed(base, means=base.params["means"] * (0.5 * depth / 4.0))
 
 
 def _axis_ratio(ratio: float) -> SceneCase:
     base = _small(4, scale=0.8)
-    logs = base.params["log_scales"].clone()
-    logs[:, 1] = logs[:, 0] - math.log(ratio)
-    return changed(base, log_scales=logs)
+    logs = base.params["log_scales"][:, :1]
+    return changed(base, log_scales=torch.cat([logs, logs - math.log(ratio)], 1))
 
 
 def _world(size: float) -> SceneCase:
@@ -202,30 +201,26 @@ def _layers(count: float) -> SceneCase:
     return changed(front_scene(int(count), 7, 8, 6, scale=2.0), opacity_logits=math.log(opacity / (1 - opacity)))
 
 
-SWEEPS: tuple[Sweep, ...] = (
+def _beta(beta: float) -> SceneCase:
+    return changed(_small(2), beta_raw=math.log(beta) - math.log(4 - beta))
+
+
+def _temperature(tau: float) -> SceneCase:
+    return changed(_small(3), sv_log_tau=math.log(tau))
+
+
+def _opacity(clear: float) -> SceneCase:
+    return changed(_small(6), opacity_logits=math.log1p(-clear) - math.log(clear))
+
+
+SWEEPS = (
     Sweep("edge-on", "angle between ray and disc [rad]", decades(0, -7), _edge_on),
-    Sweep(
-        "camera plane",
-        "depth of the centres / scale",
-        decades(1, -6),
-        lambda d: _near_plane(0.5 * d),
-        near=lambda d: 0.05 * d,
-    ),
-    Sweep(
-        "beta",
-        "beta",
-        (3.9, 1.0, *decades(-1, -7)),
-        lambda beta: changed(_small(2), beta_raw=math.log(beta) - math.log(4 - beta)),
-    ),
-    Sweep("temperature", "temperature", decades(0, 6), lambda tau: changed(_small(3), sv_log_tau=math.log(tau))),
+    Sweep("camera plane", "depth of the centres / scale", decades(1, -6), _camera_plane, near=lambda d: 0.05 * d),
+    Sweep("beta", "beta", (3.9, 1.0, *decades(-1, -7)), _beta),
+    Sweep("temperature", "temperature", decades(0, 6), _temperature),
     Sweep("axis ratio", "axis ratio", decades(0, 6), _axis_ratio),
     Sweep("world size", "distance from the origin / size of the scene", decades(0, 6), _world),
-    Sweep(
-        "opacity",
-        "1 - opacity",
-        (0.5, *decades(-1, -7)),
-        lambda clear: changed(_small(6), opacity_logits=math.log1p(-clear) - math.log(clear)),
-    ),
+    Sweep("opacity", "1 - opacity", (0.5, *decades(-1, -7)), _opacity),
     Sweep("layers", "layers", (1, 4, 16, 64, 256, 1024), _layers),
 )
 

@@ -13,8 +13,8 @@ from bitymi_ns.presets import preset_names
 
 def make_suite(root: Path, name: str) -> Path:
     """Make the folders of a standard dataset."""
-    for scene, factor in suites()[name].scenes.items():
-        for part in suites()[name].needed:
+    for scene, factor in suites()[name]["scenes"].items():
+        for part in suites()[name]["needed"]:
             (root / scene / part.format(images=f"images_{factor}" if factor > 1 else "images")).mkdir(parents=True)
     return root
 
@@ -22,8 +22,8 @@ def make_suite(root: Path, name: str) -> Path:
 def test_standard_suites_are_the_published_ones() -> None:
     found = suites()
     counts = {"mipnerf360": 9, "tanksandtemples": 2, "nerf-synthetic": 8}
-    assert {name: len(suite.scenes) for name, suite in found.items()} == counts
-    factors = found["mipnerf360"].scenes
+    assert {name: len(suite["scenes"]) for name, suite in found.items()} == counts
+    factors = found["mipnerf360"]["scenes"]
     assert {s for s, factor in factors.items() if factor == 2} == {"bonsai", "counter", "kitchen", "room"}
     assert {s for s, factor in factors.items() if factor == 4} == {"bicycle", "flowers", "garden", "stump", "treehill"}
 

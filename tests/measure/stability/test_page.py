@@ -31,7 +31,7 @@ def test_the_page_and_its_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
 def test_verdicts() -> None:
     row = page.measure_row("easy", random_scene(3, 0, 8, 8), BACKENDS["cpu"])
-    assert row.verdict == "accurate" and row.trust is not None and row.trust.gradient < 1e-10
+    assert row.verdict == "accurate" and row.exact < 1e-10
 
     def verdict(**changes: float) -> str:
         return dataclasses.replace(row, single=dataclasses.replace(row.single, **changes)).verdict

@@ -286,7 +286,7 @@ def _decode(
 
 
 def _shared(means: Tensor, sizes: Tensor, steps: Tensor) -> dict[str, Any]:
-    """Build the arguments of csrc/ops/cosine.h for all blocks. The kernels run on the CPU: codes do not depend on the
+    """Build the arguments of csrc/cpu/kernels.h for all blocks. The kernels run on the CPU: codes do not depend on the
     renderer's device."""
     channels = means.shape[1]
     of_tiles = means[sizes[:, 0] > 0].contiguous()

@@ -11,8 +11,7 @@
 #include <malloc.h>
 #endif
 
-#include "core/shading.h"
-#include "cpu/entropy.h"
+#include "core/blend.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
 
@@ -60,24 +59,6 @@ template <class Arguments> void bind_operation(nb::module_& m, const std::string
   });
 }
 
-// Pages of an atlas, to be gathered into Patches.
-struct Pages {
-  const uint8_t* bytes;
-  const float* floats;
-  std::tuple<int, int, int> shape;
-  int64_t n;
-  const int32_t* tiles;
-
-  template <class R> void fields(R& r) {
-    r.number("layers", std::get<0>(shape));
-    r.number("height", std::get<1>(shape));
-    r.number("width", std::get<2>(shape));
-    const int64_t texels = int64_t(std::get<0>(shape)) * std::get<1>(shape) * std::get<2>(shape) * 4;
-    r.maybes(texels, "bytes", bytes, "floats", floats);
-    r.rows("tiles", tiles, n, 5);
-  }
-};
-
 template <class S> void bind_tracer(nb::module_& m) {
   const std::string name = std::string("Trace") + kSuffix<S>;
   nb::class_<Trace<S>>(m, name.c_str())
@@ -124,7 +105,7 @@ void bind_entropy(nb::module_& m) {
         }
         return nb::bytes(found.data(), found.size());
       },
-      "values"_a, "blocks"_a, "others"_a.none(), "Code a number of every row of a column (cpu/entropy.h).");
+      "values"_a, "blocks"_a, "others"_a.none(), "Code a number of every row of a column (cpu/kernels.h).");
   m.def(
       "decode_integers",
       [](const nb::bytes& data, const Numbers& values, int64_t blocks, const Others& others) {
@@ -167,8 +148,7 @@ NB_MODULE(BITYMI_MODULE, m) {
         const Pages p = read<Pages>(r);
         new (self) Patches();
         nb::gil_scoped_release release;
-        const auto [layers, height, width] = p.shape;
-        gather_patches(layers, height, width, p.bytes, p.floats, p.n, p.tiles, *self);
+        gather_patches(p, *self);
       });
   bind_class<TileBlocks>(m, "TileBlocks", kHost, "The tiles and blocks of a fragment list.");
   bind_operations<float>(m);

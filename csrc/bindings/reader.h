@@ -330,17 +330,7 @@ template <class S> constexpr const char* kSuffix = sizeof(S) == 4 ? "_f32" : "_f
 }  // namespace bt
 
 // Operations of both devices: templates over the number type in bt and bt::cuda.
-// clang-format off
-#define BT_OPERATIONS(each)   \
-  each(project_forward)       \
-  each(project_backward)      \
-  each(trace_backward)        \
-  each(blend_forward)         \
-  each(blend_backward)        \
-  each(view_color_forward)    \
-  each(view_color_backward)   \
-  each(field_forward)         \
-  each(field_backward)        \
-  each(learn_exposure)        \
-  each(ssim)
-// clang-format on
+#define BT_OPERATIONS(each)                                                                                            \
+  each(project_forward) each(project_backward) each(trace_backward) each(blend_forward) each(blend_backward)           \
+      each(view_color_forward) each(view_color_backward) each(field_forward) each(field_backward) each(learn_exposure) \
+          each(ssim)

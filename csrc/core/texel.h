@@ -99,6 +99,35 @@ template <class S> BT_HD TexelCorners<S> texel_corners(S u, S v, const int32_t* 
   return c;
 }
 
+// Tiles of surfels in one list of texels: tile i of r_u x r_v texels starts at first[i]; 0, 0 = no tile.
+template <class S> struct Tiles {
+  const int64_t* first;  // [n], in texels
+  const int32_t* size;   // [n, 2]
+  const S* extent;       // [n] half side of the tile, scale units
+
+  template <class R>  // as in ops/arguments.h
+  void fields(R& r, int64_t n) {
+    r.array("first", first, n);
+    r.array("size", size, 2 * n);
+    r.array("extent", extent, n);
+  }
+};
+// The tile of one surfel, with C numbers per texel.
+template <class S, int C> struct TilePatch {
+  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
+  const S* tile;        // its texels
+  int64_t first;        // index of the first in Tiles
+  S extent;
+
+  BT_HD TilePatch(const Tiles<S>& tiles, const S* values, int64_t id)
+      : size(tiles.size + 2 * id),
+        tile(values + C * tiles.first[id]),
+        first(tiles.first[id]),
+        extent(tiles.extent[id]) {}
+  BT_HD bool textured() const { return size[0] > 0; }
+  BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
+};
+
 // Loads these texels.
 template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);

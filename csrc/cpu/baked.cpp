@@ -3,7 +3,7 @@
 #include <stdexcept>
 #include <string>
 
-#include "core/shading.h"
+#include "core/blend.h"
 #include "core/texel.h"
 #include "cpu/kernels.h"
 #include "cpu/threads.h"
@@ -137,34 +137,31 @@ inline Texels<S, channels> bilinear(const T* patch, int columns, Lanes<S> x, Lan
 }
 }  // namespace
 
-void gather_patches(int layers, int height, int width, const uint8_t* bytes, const float* floats, int64_t n,
-                    const int32_t* tiles, Patches& out) {
-  out.first.resize(n), out.sides.resize(2 * n);
+void gather_patches(const Pages& a, Patches& out) {
+  out.first.resize(a.n), out.sides.resize(2 * a.n);
   int64_t texels = 0;
   int widest = 0;
-  for (int64_t i = 0; i < n; ++i) {
-    const int32_t* t = tiles + 5 * i;
-    const bool none = (!bytes && !floats) || t[3] == 0;
+  for (int64_t i = 0; i < a.n; ++i) {
+    const int32_t* t = a.tiles + 5 * i;
+    const bool none = (!a.bytes && !a.floats) || t[3] == 0;
     const int columns = none ? 0 : t[3], rows = none ? 0 : t[4];
-    if (!none && (t[0] < 0 || t[1] < 0 || t[2] < 0 || t[2] >= layers || columns < 1 || rows < 1 ||
-                  int64_t(t[0]) + columns > width || int64_t(t[1]) + rows > height))
+    if (!none && (t[0] < 0 || t[1] < 0 || t[2] < 0 || t[2] >= a.layers || columns < 1 || rows < 1 ||
+                  int64_t(t[0]) + columns > a.width || int64_t(t[1]) + rows > a.height))
       throw std::invalid_argument("the tile of surfel " + std::to_string(i) + " does not lie on a page of the atlas");
     out.first[i] = texels, out.sides[2 * i] = columns, out.sides[2 * i + 1] = rows;
     texels += int64_t(columns) * rows;
     widest = std::max(widest, columns);
   }
   const int64_t size = 4 * (texels + widest + 2);  // a fetch at the last texel also reads neighbours, with weight 0
-  out.bytes.assign(bytes ? size : 0, 0), out.floats.assign(floats ? size : 0, 0.0f);
-  parallel_parts(n, 64, [&](int, int64_t begin, int64_t end) {
-    for (int64_t i = begin; i < end; ++i) {
-      const int32_t* t = tiles + 5 * i;
-      const int64_t line = 4 * int64_t(out.sides[2 * i]);
-      for (int row = 0; row < out.sides[2 * i + 1]; ++row) {
-        const int64_t from = 4 * ((int64_t(t[2]) * height + t[1] + row) * width + t[0]);
-        const int64_t to = 4 * out.first[i] + row * line;
-        if (bytes) std::copy_n(bytes + from, line, out.bytes.data() + to);
-        if (floats) std::copy_n(floats + from, line, out.floats.data() + to);
-      }
+  out.bytes.assign(a.bytes ? size : 0, 0), out.floats.assign(a.floats ? size : 0, 0.0f);
+  parallel_each(a.n, 64, [&](int64_t i) {
+    const int32_t* t = a.tiles + 5 * i;
+    const int64_t line = 4 * int64_t(out.sides[2 * i]);
+    for (int row = 0; row < out.sides[2 * i + 1]; ++row) {
+      const int64_t from = 4 * ((int64_t(t[2]) * a.height + t[1] + row) * a.width + t[0]);
+      const int64_t to = 4 * out.first[i] + row * line;
+      if (a.bytes) std::copy_n(a.bytes + from, line, out.bytes.data() + to);
+      if (a.floats) std::copy_n(a.floats + from, line, out.floats.data() + to);
     }
   });
 }
@@ -320,7 +317,6 @@ template <class S> void baked_forward(const BakedForward<S>& a) {
   });
 }
 
-template void baked_forward(const BakedForward<float>&);
-template void baked_forward(const BakedForward<double>&);
+BT_INSTANTIATE(baked_forward, BakedForward)
 
 }  // namespace bt

@@ -314,8 +314,7 @@ template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& 
   return made;
 }
 
-#define BT_INSTANTIATE(S) template std::unique_ptr<Binner<S>> binner(const View<S>&, Bins&);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template std::unique_ptr<Binner<float>> binner(const View<float>&, Bins&);
+template std::unique_ptr<Binner<double>> binner(const View<double>&, Bins&);
 
 }  // namespace bt

@@ -7,7 +7,6 @@
 
 #include "cpu/blocks.h"
 #include "cpu/kernels.h"
-#include "cpu/surfel_order.h"
 #include "cpu/texel_patch.h"
 
 namespace bt {
@@ -244,6 +243,39 @@ class ListedRuns {
   std::vector<Start> starts_;  // [runs + 1]
 };
 
+// Returns the runs grouped by surfel, surfels (at most n) in order of first appearance. Consecutive surfels are then
+// neighbours on the screen, so their runs lie close together in the list, as do their pixels.
+std::vector<int64_t> by_surfel(const ListedRuns& runs, int64_t n) {
+  std::vector<int32_t> rank(n, -1);
+  std::vector<int64_t> next{0};  // number of runs of each rank, then the offset of its next one
+  for (int64_t r = 0; r < runs.count(); ++r) {
+    int32_t& its = rank[runs.surfel(r)];
+    if (its < 0) its = int32_t(next.size()) - 1, next.push_back(0);
+    ++next[its + 1];
+  }
+  std::partial_sum(next.begin(), next.end(), next.begin());
+  std::vector<int64_t> order(runs.count());
+  for (int64_t r = 0; r < runs.count(); ++r) order[next[rank[runs.surfel(r)]]++] = r;
+  return order;
+}
+
+// Calls fn(k, last) for the runs order[k] to order[last - 1] of every surfel. One thread handles all runs of a surfel
+// in list order, so no other thread adds to its texels.
+template <class F> void for_surfels(const ListedRuns& runs, const int64_t* order, F&& fn) {
+  const int64_t count = runs.count();
+  std::vector<int64_t> cost(count + 1, 0);
+  for (int64_t k = 0; k < count; ++k) cost[k + 1] = cost[k] + runs.length(order[k]);
+  const auto id = [&](int64_t k) { return runs.surfel(order[k]); };
+  parallel_tiles(cost.data(), count, 1 << 20, [&](int, int64_t begin, int64_t end) {
+    while (begin > 0 && begin < count && id(begin) == id(begin - 1)) ++begin;
+    while (end < count && id(end) == id(end - 1)) ++end;
+    for (int64_t k = begin, last; k < end; k = last) {
+      for (last = k + 1; last < end && id(last) == id(k);) ++last;
+      fn(k, last);
+    }
+  });
+}
+
 // Prefetches data of the runs after run k of `order`, which are scattered over the list; stalls would dominate. First
 // their descriptions, then fragments and pixels. Always inlined: GCC drops calls of a function without other effects.
 template <int channels, class S>
@@ -308,12 +340,10 @@ template <bool kMaps, class S>
 void backward_by_run(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
                      const std::vector<int64_t>& order) {
   std::vector<Sums<S>> of_run(listed.count());
-  parallel_parts(listed.count(), 64, [&](int, int64_t begin, int64_t end) {
-    for (int64_t r = begin; r < end; ++r) {
-      Sums<Lanes<S>> sums;
-      run_backward<kMaps, S>(a, dimage, SurfelRun<S>(a.of, listed.run(r), false), nullptr, sums);
-      of_run[r] = total<kMaps>(sums);
-    }
+  parallel_each(listed.count(), 64, [&](int64_t r) {
+    Sums<Lanes<S>> sums;
+    run_backward<kMaps, S>(a, dimage, SurfelRun<S>(a.of, listed.run(r), false), nullptr, sums);
+    of_run[r] = total<kMaps>(sums);
   });
   for_surfels(listed, order.data(), [&](int64_t first, int64_t last) {
     Sums<S> sums;
@@ -340,10 +370,7 @@ template <class S> void blend_backward(const BlendBackward<S, TileBlocks>& a) {
   a.of.maps ? backward<true>(a) : backward<false>(a);
 }
 
-#define BT_INSTANTIATE(S)                                          \
-  template void blend_forward(const BlendForward<S, TileBlocks>&); \
-  template void blend_backward(const BlendBackward<S, TileBlocks>&);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(blend_forward, Forward)
+BT_INSTANTIATE(blend_backward, Backward)
 
 }  // namespace bt

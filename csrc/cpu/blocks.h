@@ -1,7 +1,6 @@
 // A tile is 16 blocks of 4 x 4 pixels, one vector each: fragments of blocks in a list, and images by block.
 #pragma once
 
-#include "cpu/memory.h"
 #include "cpu/simd.h"
 #include "cpu/threads.h"
 #include "ops/arguments.h"
@@ -115,14 +114,12 @@ template <class S, int channels> class BlockPicture {
  public:
   BlockPicture(const S* rows, int width, int height)
       : memory_(allocate(tiles_of(width, height) * kTile * kTile * channels * sizeof(S), true)) {
-    parallel_parts(tiles_of(width, height), 16, [&](int, int64_t begin, int64_t end) {
-      for (int64_t tile = begin; tile < end; ++tile) {
-        S* to = numbers(tile, 0);
-        std::fill(to, to + kTile * kTile * channels, S(0));
-        each_pixel(tile, width, height, [&](int64_t pixel, int block, int lane) {
-          for (int c = 0; c < channels; ++c) to[(block * channels + c) * kLanes + lane] = rows[pixel * channels + c];
-        });
-      }
+    parallel_each(tiles_of(width, height), 16, [&](int64_t tile) {
+      S* to = numbers(tile, 0);
+      std::fill(to, to + kTile * kTile * channels, S(0));
+      each_pixel(tile, width, height, [&](int64_t pixel, int block, int lane) {
+        for (int c = 0; c < channels; ++c) to[(block * channels + c) * kLanes + lane] = rows[pixel * channels + c];
+      });
     });
   }
   const S* numbers(int64_t tile, int block) const { return const_cast<BlockPicture*>(this)->numbers(tile, block); }

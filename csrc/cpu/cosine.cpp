@@ -1,6 +1,4 @@
 // Cosine transform of texel blocks: forward with a lane per block and channel, inverse with a lane per block.
-#include "ops/cosine.h"
-
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
 
@@ -54,7 +52,7 @@ template <class S> class BlockLanes {
 
  private:
   void gather(int64_t first, int count) {
-    alignas(64) S value[kLanes], weight[kLanes], step[kLanes];
+    alignas(64) S value[kLanes], weight[kLanes], step[kLanes] = {};
     P most(S(0)), sum(S(0));
     for (int i = 0; i < area_; ++i) {
       for (int lane = 0; lane < kLanes; ++lane) {
@@ -119,15 +117,11 @@ template <class S> void sparse_cosines(const SparseCosines<S>& a) {
     for (int64_t group = begin; group < end; ++group) lanes.run(group * kLanes);
   });
 }
-template void sparse_cosines(const SparseCosines<float>&);
-template void sparse_cosines(const SparseCosines<double>&);
+BT_INSTANTIATE(sparse_cosines, SparseCosines)
 
 template <class S> void decode_cosines(const DecodeCosines<S>& a) {
-  parallel_parts((a.blocks + kLanes - 1) / kLanes, 8, [&](int, int64_t begin, int64_t end) {
-    for (int64_t group = begin; group < end; ++group) decode(a, group * kLanes);
-  });
+  parallel_each((a.blocks + kLanes - 1) / kLanes, 8, [&](int64_t group) { decode(a, group * kLanes); });
 }
-template void decode_cosines(const DecodeCosines<float>&);
-template void decode_cosines(const DecodeCosines<double>&);
+BT_INSTANTIATE(decode_cosines, DecodeCosines)
 
 }  // namespace bt

@@ -111,10 +111,7 @@ template <class S> void texel_coverage(const TexelCoverage<S>& a) {
             [](S* to, const S* from) { to[0] += from[0], to[1] += from[1]; });
 }
 
-#define BT_INSTANTIATE(S)                                    \
-  template void surfel_coverage(const SurfelCoverage<S>& a); \
-  template void texel_coverage(const TexelCoverage<S>& a);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(surfel_coverage, SurfelCoverage)
+BT_INSTANTIATE(texel_coverage, TexelCoverage)
 
 }  // namespace bt

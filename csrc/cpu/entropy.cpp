@@ -1,11 +1,12 @@
 // Integers as tokens, coded by rANS (Duda 2013) with a table of frequencies per context, and plain bits.
-#include "cpu/entropy.h"
 
 #include <algorithm>
 #include <array>
 #include <cmath>
 #include <optional>
 #include <vector>
+
+#include "cpu/kernels.h"
 
 namespace bt {
 namespace {

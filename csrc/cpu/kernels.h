@@ -5,28 +5,28 @@
 #include <cstdint>
 #include <functional>
 #include <memory>
+#include <stdexcept>
+#include <string>
 #include <vector>
 
 #include "core/bounds.h"
 #include "core/texel.h"
-#include "cpu/memory.h"
 #include "cpu/threads.h"
 #include "ops/appearance.h"
 #include "ops/blend.h"
-#include "ops/cosine.h"
 #include "ops/field.h"
 #include "ops/texel.h"
 #include "ops/visibility.h"
-#include "ops/voronoi.h"
+
+// Instantiates a kernel, which takes Arguments<S>, for both number types.
+#define BT_INSTANTIATE(kernel, Arguments)        \
+  template void kernel(const Arguments<float>&); \
+  template void kernel(const Arguments<double>&);
 
 namespace bt {
 
 template <class S> void project_forward(const ProjectForward<S>& a);
 template <class S> void project_backward(const ProjectBackward<S>& a);
-template <class S> void sparse_cosines(const SparseCosines<S>& a);
-template <class S> void decode_cosines(const DecodeCosines<S>& a);
-template <class S> void fit_sites(const FitSites<S>& a);
-template <class S> void rank_sites(const RankSites<S>& a);
 
 // Visible surfels per tile, front to back, and the squared radii of each surfel's level set in scale units, and of its
 // low pass in pixels, 0 where the kernel covers that.
@@ -220,10 +220,22 @@ struct Patches {
   std::vector<int64_t> first;  // [n] first texel of a patch
   std::vector<int32_t> sides;  // [n, 2] r_u, r_v; 0: no tile
 };
-// Gathers pages RGBA [layers, height, width, 4], bytes or floats, the other null; tiles [n, 5]: x, y, layer, r_u, r_v.
+// Pages of an atlas, RGBA.
+struct Pages {
+  int layers, height, width;
+  const uint8_t* bytes;  // [layers, height, width, 4], or null
+  const float* floats;   // likewise
+  int64_t n;
+  const int32_t* tiles;  // [n, 5] x, y, layer, r_u, r_v
+
+  template <class R> void fields(R& r) {
+    r.numbers("layers", layers, "height", height, "width", width);
+    r.maybes(int64_t(layers) * height * width * 4, "bytes", bytes, "floats", floats);
+    r.rows("tiles", tiles, n, 5);
+  }
+};
 // Throws std::invalid_argument for a tile outside its page.
-void gather_patches(int layers, int height, int width, const uint8_t* bytes, const float* floats, int64_t n,
-                    const int32_t* tiles, Patches& out);
+void gather_patches(const Pages& a, Patches& out);
 // Forward-only renderer of a baked scene: writes image [height, width, channels] and, unless null, overdraw [height,
 // width] int32. `bins` is working memory.
 template <class S> struct BakedForward {
@@ -254,5 +266,132 @@ template <class S> struct BakedForward {
   }
 };
 template <class S> void baked_forward(const BakedForward<S>& a);
+
+// The cosine transform of texel blocks, both ways.
+constexpr int kCosines = 8;       // texels along a side of the largest block
+constexpr int kMostChannels = 3;  // of a texel
+
+// All blocks of one size, and their transform, whose coefficients are integer multiples of steps.
+template <class S> struct CosineBlocks {
+  int64_t texels, tiles, blocks;
+  int height, width, channels;  // of a block, at most kCosines each
+  const S* mean;                // [tiles, channels], subtracted
+  const S* step;                // [tiles]
+  const S* mix;                 // [channels, channels] orthonormal transform of the channels
+  const S *down, *across;       // [height, height], [width, width] cosine transforms: row k is frequency k
+  const int64_t* order;         // [height * width] stored order of coefficients, k_v width + k_u
+  const int64_t* tile;          // [blocks]
+  const int64_t* rows;          // [blocks, height, width] rows of the texels in `values`
+
+  template <class R> void fields(R& r) {
+    r.numbers("height", height, "width", width, "channels", channels);
+    if (std::min({height, width, channels}) < 1 || std::max(height, width) > kCosines || channels > kMostChannels)
+      r.refuse("blocks have 1 to 8 texels along a side, of 1 to 3 channels");
+    r.rows("mean", mean, tiles, channels);
+    r.array("step", step, tiles);
+    r.array("mix", mix, channels * channels);
+    r.array("down", down, height * height);
+    r.array("across", across, width * width);
+    r.array("order", order, height * width);
+    r.rows("tile", tile, blocks, 1);
+    r.array("rows", rows, blocks * height * width);
+  }
+};
+
+// Coefficients c of every block and channel that nearly minimise sum of weight (t - t(c))^2 + an L1 penalty: `rounds`
+// iterations of ISTA from the plain transform.
+template <class S> struct SparseCosines : CosineBlocks<S> {
+  int rounds;
+  S shrink;          // soft threshold relative to the step, for equal weights
+  const S* values;   // [texels, channels]
+  const S* weights;  // [texels], positive
+  int32_t* codes;    // [height * width, blocks, channels]
+
+  template <class R> void fields(R& r) {
+    CosineBlocks<S>::fields(r);
+    r.number("rounds", rounds);
+    r.number("shrink", shrink);
+    r.rows("values", values, this->texels, this->channels);
+    r.array("weights", weights, this->texels);
+    r.array("codes", codes, this->blocks * this->height * this->width * this->channels);
+  }
+};
+
+// Texels t(c) of the coefficients.
+template <class S> struct DecodeCosines : CosineBlocks<S> {
+  const int32_t* codes;  // as in `SparseCosines`
+  S* values;             // [texels, channels]; rows of other blocks are left
+
+  template <class R> void fields(R& r) {
+    CosineBlocks<S>::fields(r);
+    r.array("codes", codes, this->blocks * this->height * this->width * this->channels);
+    r.rows("values", values, this->texels, this->channels);
+  }
+};
+template <class S> void sparse_cosines(const SparseCosines<S>& a);
+template <class S> void decode_cosines(const DecodeCosines<S>& a);
+
+// Minimises, for each of n surfels, the sum over directions of weight |c(d) - target(d)|^2 over the vectors and colours
+// of its sites, by Levenberg-Marquardt. c is the mean of the sites' colours, weighted by softmax(vector . d); the first
+// site has the vector 0.
+template <class S> struct FitSites {
+  int64_t n;
+  int sites, directions, rounds;
+  S *vectors, *colors;  // [n, sites - 1, 3], [n, sites, 3]: the start, replaced by the fit
+  const S* samples;     // [n, directions, 7]: unit direction, target colour, weight
+
+  template <class R> void fields(R& r) {
+    r.numbers("sites", sites, "directions", directions, "rounds", rounds);
+    if (sites < 2 || sites > kMaxTerms) r.refuse("a view colour has 2 to 32 sites");
+    r.rows("colors", colors, n, 3 * sites);
+    r.array("vectors", vectors, n * 3 * (sites - 1));
+    r.array("samples", samples, n * 7 * directions);
+  }
+};
+
+// Ranks the sites of each of n surfels by how much the colour needs them. While more than one is left, removes the site
+// whose removal changes c least: by w / (1 - w) (c - color) for a site of weight w, squared and summed over the
+// directions by their weights.
+template <class S> struct RankSites {
+  int64_t n;
+  int sites, directions;
+  const S *vectors, *colors;  // [n, sites, 3] each; weights are softmax(vector . d)
+  const S* samples;           // [n, directions, 4]: unit direction, weight
+  int64_t* order;             // [n, sites]: the most needed first
+
+  template <class R> void fields(R& r) {
+    r.numbers("sites", sites, "directions", directions);
+    if (sites < 1 || sites > kMaxTerms) r.refuse("a view colour has 1 to 32 sites");
+    r.rows("colors", colors, n, 3 * sites);
+    r.array("vectors", vectors, n * 3 * sites);
+    r.array("samples", samples, n * 4 * directions);
+    r.array("order", order, n * sites);
+  }
+};
+template <class S> void fit_sites(const FitSites<S>& a);
+template <class S> void rank_sites(const RankSites<S>& a);
+
+// Entropy coding of integer columns: docs/baking.md, "Columns of integers".
+
+// Layout of a column, a number per row, and what precedes it.
+struct IntegerColumn {
+  int64_t rows;
+  // Number of blocks whose coefficients are the rows: coefficient 0 of every block, then coefficient 1, ... 0 = plain
+  // rows.
+  int64_t blocks;
+  const uint8_t* others;  // [rows] sum of the magnitudes of this row's earlier numbers, at most 2; null without any
+};
+
+// Thrown for bytes that no encoder writes.
+struct DamagedStream : std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+constexpr int kIntegerBits = 52;  // of the largest magnitude
+
+std::string encode_integers(const IntegerColumn& column, const int64_t* values);  // [rows]
+
+// Throws DamagedStream.
+void decode_integers(const IntegerColumn& column, const uint8_t* data, size_t bytes, int64_t* values);
 
 }  // namespace bt

@@ -94,10 +94,7 @@ template <class S> void project_backward(const ProjectBackward<S>& a) {
   });
 }
 
-#define BT_INSTANTIATE(S)                                  \
-  template void project_forward(const ProjectForward<S>&); \
-  template void project_backward(const ProjectBackward<S>&);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(project_forward, ProjectForward)
+BT_INSTANTIATE(project_backward, ProjectBackward)
 
 }  // namespace bt

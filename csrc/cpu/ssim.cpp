@@ -1,6 +1,5 @@
 // Structural similarity over the valid 11 x 11 Gaussian windows, separable, with its gradient.
-#include "core/ssim.h"
-
+#include "core/training.h"
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
 #include "cpu/threads.h"
@@ -166,7 +165,6 @@ template <class S> S mean_ssim(const Ssim<S>& images) {
 
 template <class S> void ssim(const Ssim<S>& a) { *a.value = mean_ssim(a); }
 
-template void ssim(const Ssim<float>&);
-template void ssim(const Ssim<double>&);
+BT_INSTANTIATE(ssim, Ssim)
 
 }  // namespace bt

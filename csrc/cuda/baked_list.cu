@@ -1,12 +1,21 @@
-// First stage of the baked renderer: the visible surfels, as rows for drawing, and their screen tiles.
+// A frame of the baked renderer: working memory, and the first stage, the visible surfels, as rows for drawing, and
+// their screen tiles.
 //
 // One thread per surfel, 44 bytes in and, if visible, 100 out. A block then lists the pairs of its surfels from their
 // footprints in shared memory. View colours (196 bytes of parameters per surfel with seven sites, 20 + 24 per term of
 // lean ones) are computed for visible surfels only, by adjacent threads: a block compacts them.
-#include "core/shading.h"
+//
+// There is no sort over all surfels or pairs, and tiles are found once. A pair takes the next slot of its tile,
+// by the tile's counter; when the slots are full, it goes to one list of all tiles. Each tile's list is sorted when the
+// tile is drawn (baked_sort.h), so the image does not depend on the order of insertion.
+#include <stdexcept>
+#include <string>
+
+#include "core/blend.h"
 #include "core/view_color.h"
-#include "cuda/baked_pairs.h"
+#include "cuda/baked_stages.h"
 #include "cuda/sort_scan.h"
+#include "cuda/warp.h"
 
 namespace bt::cuda {
 
@@ -15,6 +24,104 @@ constexpr int64_t kMostBlocks = 1024;  // a block takes fewer surfels while ther
 constexpr int kLeastOwned = 4;         // but at least this many surfels
 constexpr int kLargeParts = 16;        // shares of the tile rows of a surfel with many tiles
 constexpr int kLargeBlocks = 528;      // four per multiprocessor of a large GPU
+constexpr int kListThreads = 128, kListWarps = kListThreads / kWarp;
+constexpr int kLarge = 128;  // tiles from which a surfel is handled by `large_pairs_kernel`
+
+// Exclusive prefix sum over the block's threads, with barriers. `sums`: kListWarps numbers in shared memory.
+__device__ int block_sum_before(int value, int* sums, int& total) {
+  const int lane = threadIdx.x % kWarp, warp = threadIdx.x / kWarp;
+  int before = sum_below(value, lane);
+  if (lane == kWarp - 1) sums[warp] = before + value;
+  __syncthreads();
+  total = 0;
+  for (int k = 0; k < kListWarps; ++k) {
+    if (k < warp) before += sums[k];
+    total += sums[k];
+  }
+  __syncthreads();
+  return before;
+}
+// Returns the index of the last number that is at most i, of `count` > 0 ascending ones from 0 on.
+__device__ int last_at_most(const int* numbers, int count, int i) {
+  int low = 0;
+  for (int high = count; high - low > 1;) {
+    const int middle = (low + high) / 2;
+    (numbers[middle] <= i ? low : high) = middle;
+  }
+  return low;
+}
+
+// Storage of a footprint in shared memory, where constructors are not allowed.
+struct alignas(Footprint<float>) FootprintRoom {
+  unsigned char bytes[sizeof(Footprint<float>)];
+};
+__device__ Footprint<float>& footprint_in(FootprintRoom& room) { return *reinterpret_cast<Footprint<float>*>(&room); }
+
+// Bounds the number of tiles listed for a surfel with a box.
+__device__ int most_tiles(const Footprint<float>& of, const BakedFrame& f) {
+  const Interval<float> x = columns_of(of);
+  const int left = pixel_from(x.x0, f.width) / kTile, right = pixel_to(x.x1, f.width) / kTile;
+  return (of.bottom - of.top + 1) * max_(right - left + 1, 1);
+}
+
+// Returns the first tile of the row of tiles `ty`, in the view of the surfel with row `r`.
+__device__ uint32_t first_tile(const BakedFrame& f, uint32_t r, int ty) {
+  return r / uint32_t(f.n) * uint32_t(f.tiles_x * f.tiles_y) + uint32_t(ty * f.tiles_x);
+}
+
+__device__ void list_pair(const BakedFrame& f, uint32_t r, uint32_t tile, uint32_t parts) {
+  const BakedMemory& m = f.memory;
+  TileList& list = m.lists[tile];
+  const uint32_t pair = r << 8 | parts;
+  const int number = atomicAdd(&list.count, 1);
+  if (number == f.long_from) {
+    const int32_t at = atomicAdd(m.long_count, 1);
+    m.long_tiles[at] = tile, list.long_index = uint32_t(at + 1);
+  }
+  if (number < f.slots) {
+    m.pairs[int64_t(tile) * f.slots + number] = pair;
+    return;
+  }
+  const int64_t at = add_to(m.spilled_count, 1);
+  if (at < f.capacity) m.spilled[at] = {pair, atomicExch(&list.chains[number % kChains], uint32_t(at + 1))};
+}
+
+// Lists the pairs of the block's surfels: `area` has the footprints of `owned` of them, starting at row `first`; `mine`
+// is the number of tile rows of the thread's surfel. Threads first take a row of tiles each, then a pair each, so that
+// the load is balanced for surfels of any height and width.
+__device__ void list_pairs(const BakedFrame& f, FootprintRoom* area, int owned, int64_t first, int mine) {
+  __shared__ int first_row[kListThreads];  // rows of tiles before a surfel's
+  __shared__ TileRow row[kListThreads];
+  __shared__ uint32_t row_id[kListThreads], row_tile[kListThreads];  // a row's surfel and its leftmost tile
+  __shared__ int first_pair[kListThreads];                           // pairs before a row's
+  __shared__ int sums[kListWarps];
+  const int me = threadIdx.x;
+  int rows = 0;
+  first_row[me] = block_sum_before(mine, sums, rows);
+  __syncthreads();
+  for (int next = 0; next < rows; next += kListThreads) {
+    const int taken = min_(rows - next, kListThreads);
+    int pairs = 0, width = 0;
+    if (me < taken) {
+      const int surfel = last_at_most(first_row, owned, next + me);
+      const Footprint<float>& of = footprint_in(area[surfel]);
+      const int ty = of.top + (next + me - first_row[surfel]);
+      const TileRow mine = tile_row(of, ty, f.width);
+      width = mine.right - mine.left + 1;
+      row[me] = mine;
+      row_id[me] = uint32_t(first + surfel);
+      row_tile[me] = first_tile(f, row_id[me], ty) + uint32_t(mine.left);
+    }
+    first_pair[me] = block_sum_before(width, sums, pairs);
+    if (me == 0 && pairs > 0) add_to(f.memory.total, pairs);
+    __syncthreads();
+    for (int k = me; k < pairs; k += kListThreads) {
+      const int of = last_at_most(first_pair, taken, k), right = k - first_pair[of];
+      list_pair(f, row_id[of], row_tile[of] + uint32_t(right), part_mask(row[of], row[of].left + right));
+    }
+    __syncthreads();
+  }
+}
 
 // The presets' numbers of terms are constants, so that loops unroll and local memory is not used.
 __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
@@ -159,6 +266,48 @@ __global__ void __launch_bounds__(kListThreads, 4) large_pairs_kernel(BakedFrame
   if (lane == 0 && listed) add_to(m.total, listed);
 }
 
+// The host side of a frame.
+constexpr int kLong = 2;         // a long list has more than this times the mean capacity,
+constexpr int kLeastLong = 128;  // and at least this many pairs
+
+// Divides the working memory into arrays; returns the bytes needed. With a null base it only counts.
+int64_t lay_out(BakedFrame& f, void* base, bool normals) {
+  Arena arena(base);
+  BakedMemory& m = f.memory;
+  m.total = arena.take<int64_t>(4), m.spilled_count = m.total + 1, m.rest_count = m.total + 2;
+  m.large_count = reinterpret_cast<int32_t*>(m.total + 3), m.long_count = m.large_count + 1;
+  m.lists = arena.take<TileList>(f.tiles);
+  m.cleared = arena.used();
+  m.rows = arena.take<float>(f.rows * kRow);
+  m.normals = normals ? arena.take<float4>(f.rows) : nullptr;
+  m.depth = arena.take<uint32_t>(f.rows);
+  m.pairs = arena.take<uint32_t>(f.tiles * f.slots + f.capacity);
+  m.spilled = arena.take<SpilledPair>(f.capacity);
+  m.large = arena.take<uint32_t>(f.rows), m.long_tiles = arena.take<uint32_t>(f.tiles);
+  return arena.used();
+}
+
+BakedFrame frame_of(int64_t surfels, const BakedViews& v, int slots, int64_t capacity) {
+  BakedFrame f = {};
+  f.n = surfels, f.rows = surfels * v.count;
+  f.width = v.width, f.height = v.height;
+  f.tiles_x = tiles_across(v.width), f.tiles_y = tiles_across(v.height);
+  f.tiles = int64_t(f.tiles_x) * f.tiles_y * v.count;
+  f.slots = slots, f.capacity = max_<int64_t>(capacity, 1);
+  if (slots < kWarp || slots % kWarp)
+    throw std::invalid_argument("a tile has " + std::to_string(slots) + " slots, it needs a multiple of " +
+                                std::to_string(kWarp));
+  f.long_from = int(max_<int64_t>(kLong * f.capacity / max_<int64_t>(f.tiles, 1), kLeastLong));
+  if (f.rows > kMostRows)
+    throw std::invalid_argument("surfels times views is " + std::to_string(f.rows) + ", at most " +
+                                std::to_string(kMostRows) + " are drawn in one call: draw fewer views at once");
+  // pair indices have 32 bits
+  if (f.capacity > kMostPairs || f.tiles > kMostPairs / slots || v.count > 65535)
+    throw std::invalid_argument(
+        "too many views, pixels or pairs of surfel and tile for one call: draw fewer views at "
+        "once, or smaller ones");
+  return f;
+}
 }  // namespace
 
 void baked_list(const BakedScene& s, const BakedViews& v, const BakedFrame& f, Stream stream) {
@@ -171,6 +320,22 @@ void baked_list(const BakedScene& s, const BakedViews& v, const BakedFrame& f, S
   });
   const dim3 large(unsigned(min_<int64_t>(kLargeBlocks, ceil_div(f.rows * kLargeParts, kListWarps))));
   BT_LAUNCH(large_pairs_kernel, large, dim3(kListThreads), 0, stream, f);
+}
+
+size_t baked_memory(int64_t surfels, const BakedViews& views, int slots, int64_t capacity, bool normals) {
+  BakedFrame f = frame_of(surfels, views, slots, capacity);
+  return lay_out(f, nullptr, normals);
+}
+
+void baked_frame(const BakedDraw& a, Stream stream) {
+  BakedFrame f = frame_of(a.scene->geometry.n, a.views, a.slots, a.capacity);
+  f.photo_pixel = a.photo_pixel;
+  const int64_t needed = lay_out(f, a.memory.at, a.images.normal != nullptr);
+  if (a.memory.bytes < needed)
+    throw std::invalid_argument("the working memory has " + std::to_string(a.memory.bytes) +
+                                " bytes, the frame needs " + std::to_string(needed));
+  if (f.rows && a.stages & kList) baked_list(*a.scene, a.views, f, stream);
+  if (a.stages & kDraw) baked_draw(*a.scene, a.images, f, stream);
 }
 
 }  // namespace bt::cuda

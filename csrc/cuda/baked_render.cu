@@ -11,8 +11,8 @@
 // traffic is 96 bytes per row and warp, mostly from L2.
 #include <type_traits>
 
+#include "core/blend.h"
 #include "core/kernel.h"
-#include "core/shading.h"
 #include "core/texel.h"
 #include "cuda/atlas_texture.h"
 #include "cuda/baked_sort.h"

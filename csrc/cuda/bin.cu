@@ -192,8 +192,6 @@ __global__ void __launch_bounds__(kThreads)
   }
   tile_pairs[t] = low;
 }
-
-dim3 blocks(int64_t threads) { return dim3(unsigned(ceil_div(threads, kThreads))); }
 }  // namespace
 
 template <class S> int64_t bin_count_workspace(int64_t n) {
@@ -212,9 +210,9 @@ template <class S> void bin_count(const BinCount<S>& a, Stream stream) {
   const int64_t n = v.n;
   Arena arena(a.workspace.of(bin_count_workspace<S>(n)));
   const CountSpace<S> w(arena, n);
-  if (n) BT_LAUNCH(count_kernel<S>, blocks(n), dim3(kThreads), 0, stream, v, w);
+  BT_LAUNCH_EACH(count_kernel<S>, n, kThreads, stream, v, w);
   sort_pairs(w.keys, w.sorted, w.rows, a.order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
-  BT_LAUNCH(rank_kernel, blocks(n + 1), dim3(kThreads), 0, stream, n, a.order, w.counts, w.ranked);
+  BT_LAUNCH_EACH(rank_kernel, n + 1, kThreads, stream, n, a.order, w.counts, w.ranked);
   exclusive_sum(w.ranked, a.slot_start, n + 1, w.temp, w.temp_size, stream);
 }
 
@@ -224,18 +222,16 @@ template <class S> void bin_fill(const BinFill<S>& a, Stream stream) {
   Arena arena(a.workspace.of(bin_fill_workspace(pairs, v.width, v.height)));
   const FillSpace w(arena, pairs, tiles);
   if (pairs) {
-    BT_LAUNCH(list_kernel<S>, blocks(v.n), dim3(kThreads), 0, stream, v, a.order, a.slot_start, w);
+    BT_LAUNCH_EACH(list_kernel<S>, v.n, kThreads, stream, v, a.order, a.slot_start, w);
     sort_pairs(w.tile, w.sorted, w.slots, a.slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);
-    BT_LAUNCH(owner_kernel, blocks(pairs), dim3(kThreads), 0, stream, pairs, a.slot, w.owner, a.surfel);
+    BT_LAUNCH_EACH(owner_kernel, pairs, kThreads, stream, pairs, a.slot, w.owner, a.surfel);
   }
-  BT_LAUNCH(range_kernel, blocks(tiles + 1), dim3(kThreads), 0, stream, pairs, w.sorted, tiles, a.tile_pairs);
+  BT_LAUNCH_EACH(range_kernel, tiles + 1, kThreads, stream, pairs, w.sorted, tiles, a.tile_pairs);
 }
 
-#define BT_INSTANTIATE(S)                              \
-  template int64_t bin_count_workspace<S>(int64_t);    \
-  template void bin_count(const BinCount<S>&, Stream); \
-  template void bin_fill(const BinFill<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template int64_t bin_count_workspace<float>(int64_t);
+template int64_t bin_count_workspace<double>(int64_t);
+BT_INSTANTIATE(bin_count, BinCount)
+BT_INSTANTIATE(bin_fill, BinFill)
 
 }  // namespace bt::cuda

@@ -72,13 +72,6 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
   for (int c = 0; c < kChannels; ++c) to[c] = sum[c];
 }
 
-// Outputs of the backward kernel; null: not requested.
-template <class S> struct Gradients {
-  S *weight, *uv, *depth, *residual, *partial;
-  S* texels;  // sums, unless exact
-  bool sums_texels, squares;
-};
-
 // Source of residual colours: none, texels, or one listed per fragment.
 enum class Residual { kNone, kTexels, kListed };
 // Resident blocks per multiprocessor, as registers allow: texel fetches and the sums of their gradients take 80 in
@@ -91,20 +84,21 @@ template <class S, bool kMaps, Residual kResidual> constexpr int resident() {
 // Runs are read and written from a multiple of 8 fragments, as whole sectors of 32 bytes are faster than parts.
 template <class S, bool kMaps, Residual kResidual, bool kExact>
 __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
-    backward_kernel(BlendedSurfels<S, Pairs> of, const S* __restrict__ dimage, Gradients<S> out, ExactSums exact) {
+    backward_kernel(BlendBackward<S, Pairs> a, ExactSums exact) {
   constexpr int kChannels = kMaps ? kMapChannels : kImageChannels, kSums = blend_sums(kMaps);
   constexpr int kWorkers = kTileThreads / kRunLanes, kWhole = 8;
   constexpr bool kTexels = kResidual == Residual::kTexels, kListed = kResidual == Residual::kListed;
   __shared__ S gradient[kTileThreads * kChannels];
+  const BlendedSurfels<S, Pairs>& of = a.of;
   const Pairs& p = of.fragments.layout;
   const FragmentArrays<S>& f = of.fragments.f;
   const auto [first, end] = block_pairs(p);
   if (first == end) return;
   const TilePart tile(p);
-  tile.load<kChannels>(dimage, gradient);
+  tile.load<kChannels>(a.dimage, gradient);
   __syncthreads();
   Adder<S, kExact> texel_sums = {};
-  if constexpr (kTexels) texel_sums = adder<kExact>(out.texels, exact);
+  if constexpr (kTexels) texel_sums = adder<kExact>(a.work.sums, exact);
   const int lane = int(threadIdx.x) % kRunLanes, worker = int(threadIdx.x) / kRunLanes;
   // Both runs of a warp loop equally often, as its shuffles need all lanes.
   for (int64_t k = first + worker; k - worker % 2 < end; k += kWorkers) {
@@ -140,32 +134,32 @@ __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
       if constexpr (kListed) color = shaded(color, residual);
       if (textured) {
         corners = patch.corners(u, v);
-        color = patch.color(corners, out.uv != nullptr, slopes);
+        color = patch.color(corners, a.duv != nullptr, slopes);
       }
       if (mine) {
         const S* d = gradient + tile.at(pixel) * kChannels;
         const S rgb[3] = {color.x, color.y, color.z};
-        if (out.weight) out.weight[i] = weight_gradient<kMaps>(d, rgb, beta, depth, normal);
+        if (a.dweight) a.dweight[i] = weight_gradient<kMaps>(d, rgb, beta, depth, normal);
         dcolor = residual_gradient(color, w * load3(d));
         sums[0] += w * d[4];
         sums[1] += dcolor.x, sums[2] += dcolor.y, sums[3] += dcolor.z;
         if constexpr (kMaps) {
-          out.depth[i] = w * d[5];
+          a.ddepth[i] = w * d[5];
           BT_UNROLL
           for (int c = 0; c < 3; ++c) sums[4 + c] += w * d[6 + c];
         }
         if constexpr (kListed)
-          if (out.residual) store3(out.residual + 3 * i, dcolor);
-        if (out.uv) out.uv[i] = dot(dcolor, slopes.u), out.uv[f.total + i] = dot(dcolor, slopes.v);
+          if (a.dresidual) store3(a.dresidual + 3 * i, dcolor);
+        if (a.duv) a.duv[i] = dot(dcolor, slopes.u), a.duv[f.total + i] = dot(dcolor, slopes.v);
       }
-      if (kTexels && out.sums_texels) {
-        const S d[4] = {dcolor.x, dcolor.y, dcolor.z, out.squares ? w * dcolor.x : S(0)};
+      if (kTexels && a.moved) {
+        const S d[4] = {dcolor.x, dcolor.y, dcolor.z, a.squares ? w * dcolor.x : S(0)};
         add_to_corners(textured ? patch.first + corners.at[0] : int64_t(-1), corners, d, int(threadIdx.x) % kWarp,
                        texel_sums);
       }
     }
     const S sum = sum_over_run(sums, lane);
-    if (some && lane < kSums) out.partial[int64_t(p.slot[k]) * kSums + lane] = sum;
+    if (some && lane < kSums) a.partial[int64_t(p.slot[k]) * kSums + lane] = sum;
   }
 }
 
@@ -184,11 +178,9 @@ template <class S> struct StoreSurfelGradient {
 template <class S, bool kMaps, Residual kResidual, bool kExact>
 void run_backward(const BlendBackward<S, Pairs>& a, const ExactSums& exact, Stream stream) {
   const Pairs& p = a.of.fragments.layout;
-  const Gradients<S> out = {a.dweight, a.duv,       a.ddepth,           a.dresidual,
-                            a.partial, a.work.sums, a.moved != nullptr, a.squares != nullptr};
   if (p.pairs)
     BT_LAUNCH((backward_kernel<S, kMaps, kResidual, kExact>), dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream,
-              a.of, a.dimage, out, exact);
+              a, exact);
   fill_zero(a.dgeom, p.surfels * kGeom, stream);
   sum_slots<blend_sums(kMaps)>(p, static_cast<const S*>(a.partial),
                                StoreSurfelGradient<S>{a.of.table.base, a.dgeom, a.dbase}, stream);
@@ -225,10 +217,9 @@ template <class S> void blend_backward(const BlendBackward<S, Pairs>& a, Stream 
   a.of.maps ? backward<S, true>(a, stream) : backward<S, false>(a, stream);
 }
 
-#define BT_INSTANTIATE(S)                                             \
-  template void blend_forward(const BlendForward<S, Pairs>&, Stream); \
-  template void blend_backward(const BlendBackward<S, Pairs>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template void blend_forward(const BlendForward<float, Pairs>&, Stream);
+template void blend_forward(const BlendForward<double, Pairs>&, Stream);
+template void blend_backward(const BlendBackward<float, Pairs>&, Stream);
+template void blend_backward(const BlendBackward<double, Pairs>&, Stream);
 
 }  // namespace bt::cuda

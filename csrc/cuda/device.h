@@ -79,6 +79,15 @@ constexpr int bounded_blocks(int blocks, int threads) {
   return blocks * threads > kMostThreads ? kMostThreads / threads : blocks;
 }
 
+constexpr int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
+
+// Launches a kernel with `threads` per block, one for each of n items; nothing without any.
+#define BT_LAUNCH_EACH(kernel, n, threads, stream, ...)                                 \
+  do {                                                                                  \
+    if (const int64_t blocks = ::bt::cuda::ceil_div(n, threads); blocks > 0)            \
+      BT_LAUNCH(kernel, dim3(unsigned(blocks)), dim3(threads), 0, stream, __VA_ARGS__); \
+  } while (0)
+
 // Zeroes memory of any number type.
 template <class T> void fill_zero(T* to, int64_t count, Stream stream) {
   if (count <= 0) return;
@@ -89,8 +98,6 @@ template <class T> void fill_zero(T* to, int64_t count, Stream stream) {
   for (int64_t i = 0; i < count; ++i) to[i] = T(0);
 #endif
 }
-
-constexpr int64_t ceil_div(int64_t a, int64_t b) { return (a + b - 1) / b; }
 
 // Working memory, one block from which arrays are cut. With a null block it counts the bytes, else it returns
 // addresses: one description serves both.

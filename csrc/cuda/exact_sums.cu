@@ -1,7 +1,7 @@
 // Units of exact sums, and their conversion.
 #include <cmath>
 
-#include "cuda/exact_sums.h"
+#include "cuda/warp.h"
 
 namespace bt::cuda {
 
@@ -78,15 +78,14 @@ ExactSums begin_exact(int64_t* memory, int64_t entries, const FieldArrays<S>* fi
 }
 
 template <class S> void end_exact(const ExactSums& exact, int64_t entries, S* to, Stream stream) {
-  if (entries)
-    BT_LAUNCH(convert_kernel<S>, dim3(unsigned(ceil_div(entries, kThreads))), dim3(kThreads), 0, stream, entries,
-              exact.sums, &exact.range->scale, to);
+  BT_LAUNCH_EACH(convert_kernel<S>, entries, kThreads, stream, entries, exact.sums, &exact.range->scale, to);
 }
 
-#define BT_INSTANTIATE(S)                                                                                          \
-  template ExactSums begin_exact<S>(int64_t*, int64_t, const FieldArrays<S>*, int64_t, int64_t, const S*, Stream); \
-  template void end_exact<S>(const ExactSums&, int64_t, S*, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template ExactSums begin_exact<float>(int64_t*, int64_t, const FieldArrays<float>*, int64_t, int64_t, const float*,
+                                      Stream);
+template ExactSums begin_exact<double>(int64_t*, int64_t, const FieldArrays<double>*, int64_t, int64_t, const double*,
+                                       Stream);
+template void end_exact<float>(const ExactSums&, int64_t, float*, Stream);
+template void end_exact<double>(const ExactSums&, int64_t, double*, Stream);
 
 }  // namespace bt::cuda

@@ -10,6 +10,11 @@
 #include "ops/blend.h"
 #include "ops/field.h"
 
+// Instantiates a kernel, which takes Arguments<S>, for both number types.
+#define BT_INSTANTIATE(kernel, Arguments)                \
+  template void kernel(const Arguments<float>&, Stream); \
+  template void kernel(const Arguments<double>&, Stream);
+
 namespace bt::cuda {
 
 // Explains why the kernels cannot run on CUDA device number `device`, with the remedy; empty if they can. Runs nothing.
@@ -64,27 +69,34 @@ template <class S> struct BinFill {
 int64_t bin_fill_workspace(int64_t pairs, int width, int height);
 template <class S> void bin_fill(const BinFill<S>& a, Stream stream);
 
-// Finds which pixels blend which pairs: writes masks [kTileWarps, pairs] and offsets [pairs + 1]; offsets[pairs] is the
-// number of fragments.
-template <class S> struct TraceMark {
+// A view with its pairs in list order, and the pixels that blend each: masks [kTileWarps, pairs] are written.
+template <class S> struct MarkedView {
   View<S> view;
   AlphaTiles<S> alpha;
   int64_t pairs;
   const int32_t* surfel;
   const int64_t* tile_pairs;
-  uint32_t* masks;
-  int64_t* offsets;
-  Workspace workspace;
+  uint32_t *masks, *cuts;  // cuts [kTileWarps, pairs]: where alpha texels multiply sigma; may be null
 
   template <class R> void fields(R& r) {
     view.fields(r);
     alpha.fields(r, view.n);
     r.rows("surfel", surfel, pairs, 1);
     check_pairs(r, pairs);
-    const int64_t tiles = tiles_of(view.width, view.height);
-    r.array("tile_pairs", tile_pairs, tiles + 1);
+    r.array("tile_pairs", tile_pairs, tiles_of(view.width, view.height) + 1);
     r.array("masks", masks, kTileWarps * pairs);
-    r.array("offsets", offsets, pairs + 1);
+    r.maybe("cuts", cuts, kTileWarps * pairs);
+  }
+};
+
+// Finds which pixels blend which pairs, and writes offsets [pairs + 1]; offsets[pairs] is the number of fragments.
+template <class S> struct TraceMark : MarkedView<S> {
+  int64_t* offsets;
+  Workspace workspace;
+
+  template <class R> void fields(R& r) {
+    MarkedView<S>::fields(r);
+    r.array("offsets", offsets, this->pairs + 1);
     r.memory("workspace", workspace);
   }
 };
@@ -126,40 +138,45 @@ struct SelectPairs {
 void select_fragments(const SelectPairs& a, Stream stream);
 
 // Draws a view without a fragment list: `trace` and `blend` in one, opaque or with alpha texels, without maps. Writes
-// image [height, width, kImageChannels] as BlendForward, and for the backward pass masks and cuts [kTileWarps, pairs]
-// and each pixel's transmittance [height, width]. cuts may be null.
-template <class S> struct RasterizeForward {
-  View<S> view;
-  AlphaTiles<S> alpha;
+// image [height, width, kImageChannels] as BlendForward, and for the backward pass masks, cuts and each pixel's
+// transmittance [height, width].
+template <class S> struct RasterizeForward : MarkedView<S> {
   TexelTiles<S> table;
   S bound;
-  int64_t pairs;
-  const int32_t* surfel;
-  const int64_t* tile_pairs;
-  uint32_t *masks, *cuts;
   S *image, *transmittance;
 
   template <class R> void fields(R& r) {
-    view.fields(r);
-    alpha.fields(r, view.n);
+    MarkedView<S>::fields(r);
     table.fields(r);
-    if (table.n != view.n || (alpha.values && alpha.texels != table.texels))
-      r.refuse("the tiles belong to other surfels or other alphas");
+    check_tiles(r, table, this->alpha, this->view.n);
     r.number("bound", bound);
-    r.rows("surfel", surfel, pairs, 1);
-    check_pairs(r, pairs);
-    r.array("tile_pairs", tile_pairs, tiles_of(view.width, view.height) + 1);
-    r.array("masks", masks, kTileWarps * pairs);
-    r.maybe("cuts", cuts, kTileWarps * pairs);
-    const int64_t pixels = int64_t(view.width) * view.height;
+    const int64_t pixels = int64_t(this->view.width) * this->view.height;
     r.array("image", image, pixels * kImageChannels);
     r.array("transmittance", transmittance, pixels);
   }
 };
 template <class S> void rasterize_forward(const RasterizeForward<S>& a, Stream stream);
 
+// The step of texels and the gradients of their alphas, as BlendBackward and TraceBackward have them. sums [texels, 4]:
+// working memory, if texels move or their alphas have gradients.
+template <class S> struct TexelStep {
+  const S* share;
+  S rate;
+  S *moved, *sums, *dalpha;
+
+  template <class R> void fields(R& r, int64_t texels, bool alpha) {
+    r.maybe("share", share, texels);
+    r.number("rate", rate);
+    r.maybe("moved", moved, 3 * texels);
+    r.maybe("dtexel_alpha", dalpha, alpha ? texels : 0);
+    r.maybe("texel_work", sums, 4 * texels);
+    if (moved && !share) r.refuse("texels move by a share of each");
+    if ((moved || dalpha) && !sums) r.refuse("gradients of texels need working memory");
+  }
+};
+
 // Gradients as of TraceBackward and BlendBackward, except those of fragments. moves: texel coordinates pass gradients
-// to surfels. texel_sums [texels, 4]: working memory if texels move or their alphas have gradients.
+// to surfels.
 template <class S> struct RasterizeBackward {
   View<S> view;
   S rim;
@@ -168,38 +185,30 @@ template <class S> struct RasterizeBackward {
   S bound;
   Pairs layout;
   const uint32_t* cuts;
-  const S *transmittance, *dimage, *share;
-  S rate;
+  const S *transmittance, *dimage;
   int moves;
-  S *partial, *color_partial, *texel_sums, *dgeom, *absgrad, *dbase, *moved, *dtexel_alpha;
+  S *partial, *color_partial, *dgeom, *absgrad, *dbase;
+  TexelStep<S> step;
 
   template <class R> void fields(R& r) {
     view.fields(r);
-    r.number("rim", rim);
     alpha.fields(r, view.n);
     table.fields(r);
-    r.number("bound", bound);
+    check_tiles(r, table, alpha, view.n);
+    r.numbers("rim", rim, "bound", bound, "moves", moves);
     take(r, "layout", layout);
-    if (table.n != view.n || !layout.fits(view.n, view.width, view.height) ||
-        (alpha.values && alpha.texels != table.texels))
-      r.refuse("layout, surfels and tiles do not belong together");
+    if (!layout.fits(view.n, view.width, view.height)) r.refuse("the layout belongs to another view");
     r.maybe("cuts", cuts, kTileWarps * layout.pairs);
     if (alpha.values && !cuts) r.refuse("alpha texels need cuts");
     const int64_t pixels = int64_t(view.width) * view.height;
     r.array("transmittance", transmittance, pixels);
     r.array("dimage", dimage, pixels * kImageChannels);
-    r.maybe("share", share, table.texels);
-    r.numbers("rate", rate, "moves", moves);
     r.work("partial", partial, layout.pairs * kTraceSums);
     r.work("color_partial", color_partial, layout.pairs * 4);
     r.array("dgeom", dgeom, view.n * kGeom);
     r.array("absgrad", absgrad, view.n * 2);
     r.array("dbase", dbase, view.n * 3);
-    r.maybe("moved", moved, 3 * table.texels);
-    r.maybe("dtexel_alpha", dtexel_alpha, alpha.values ? alpha.texels : 0);
-    r.maybe("texel_work", texel_sums, 4 * table.texels);
-    if (moved && !share) r.refuse("texels move by a share of each");
-    if ((moved || dtexel_alpha) && !texel_sums) r.refuse("gradients of texels need working memory");
+    step.fields(r, table.texels, alpha.values);
   }
 };
 template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream stream);

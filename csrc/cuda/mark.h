@@ -1,13 +1,41 @@
 // Front-to-back pass of a tile's block over its pairs, which finds the pixels that blend each.
 #pragma once
 
+#include <cstring>
+
 #include "core/kernel.h"
 #include "core/visibility.h"
 #include "cuda/fast_float.h"
-#include "cuda/fragment_list.h"
-#include "cuda/texel_alpha.h"
+#include "cuda/kernels.h"
 
 namespace bt::cuda {
+
+// v with the last mantissa bit set or cleared, which marks a multiplied sigma.
+template <class S> using BitsOf = std::conditional_t<sizeof(S) == 4, uint32_t, uint64_t>;
+template <class S> __device__ BitsOf<S> bits_of(S v) {
+  BitsOf<S> bits;
+  memcpy(&bits, &v, sizeof bits);
+  return bits;
+}
+template <class S> __device__ bool is_marked(S v) { return bits_of(v) & 1; }
+template <class S> __device__ S with_mark(S v, bool mark) {
+  const BitsOf<S> bits = (bits_of(v) & ~BitsOf<S>(1)) | BitsOf<S>(mark);
+  memcpy(&v, &bits, sizeof bits);
+  return v;
+}
+
+// Multiplies the sigma (>= 1/255) of a surfel's fragment if its weight would be at least the bound, and marks v;
+// returns whether it did. Shared by both passes over a view, so that they agree.
+template <class S> __device__ bool cut(const AlphaTiles<S>& tiles, int64_t id, S transmittance, S u, S& v, S& sigma) {
+  const AlphaPatch<S> patch(tiles, id);
+  if (!patch.textured()) return false;
+  const bool reaches = blend(sigma, transmittance).weight >= tiles.bound;
+  v = with_mark(v, reaches);
+  if (!reaches) return false;
+  S t[4];
+  sigma = alpha_cut(sigma, patch.fetch(patch.corners(u, v), t));
+  return true;
+}
 
 // Returns true if the support or low pass of a surfel without a box may reach the warp's pixels.
 template <class S> __device__ bool reached_by_warp(const S* g, const TileThread& s) {
@@ -18,17 +46,15 @@ template <class S> __device__ bool reached_by_warp(const S* g, const TileThread&
   return r.support || r.centre;
 }
 
-// Writes the masks of a tile's pairs and, with kAlpha and unless null, `cuts`: the fragments whose sigma alpha texels
-// multiplied. Calls blended(surfel, g, fragment, weight) for every fragment, in the lane of its pixel. Returns the
-// remaining transmittance.
+// Writes the masks of a tile's pairs and, with kAlpha and unless null, `cuts`. Calls blended(surfel, g, fragment,
+// weight) for every fragment, in the lane of its pixel. Returns the remaining transmittance.
 template <bool kAlpha, class S, class Blended>
-__device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>& alpha, int64_t pairs,
-                                        const int32_t* surfel, const int64_t* tile_pairs, uint32_t* masks,
-                                        uint32_t* cuts, const TileThread& s, Blended&& blended) {
+__device__ __forceinline__ S mark_pairs(const MarkedView<S>& a, const TileThread& s, Blended&& blended) {
   using T = FastFloatOr<S>;
-  const int64_t end = tile_pairs[blockIdx.x + 1];
-  int64_t first = tile_pairs[blockIdx.x];
-  uint32_t* row = masks + s.warp * pairs;
+  const View<S>& view = a.view;
+  const int64_t end = a.tile_pairs[blockIdx.x + 1];
+  int64_t first = a.tile_pairs[blockIdx.x];
+  uint32_t* row = a.masks + s.warp * a.pairs;
   const S x = pixel_centre<S>(s.x), y = pixel_centre<S>(s.y);
   bool open = s.x < view.width && s.y < view.height;  // the pixel is not ended
   S transmittance = S(1);
@@ -38,7 +64,7 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
     int32_t id = 0;
     bool meets = false;
     if (own < end) {
-      id = surfel[own];
+      id = a.surfel[own];
       const S* g = view.geom + int64_t(id) * kGeom;
       const S rx = view.radii[2 * int64_t(id)], ry = view.radii[2 * int64_t(id) + 1];
       // the centre of a disc without a box may lie beyond its radii
@@ -64,7 +90,7 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
       bool is_cut = false;
       if constexpr (kAlpha) {
         S v = plain(f.v);
-        if (open && sigma >= S(kAlphaMin)) is_cut = cut(alpha, drawn, transmittance, plain(f.u), v, sigma);
+        if (open && sigma >= S(kAlphaMin)) is_cut = cut(a.alpha, drawn, transmittance, plain(f.u), v, sigma);
       }
       const Blend<S> b = blend(sigma, transmittance);
       const BlendTest<S> test = blend_test(open, sigma, b.behind, S(kTransmittanceMin));
@@ -76,14 +102,14 @@ __device__ __forceinline__ S mark_pairs(const View<S>& view, const AlphaTiles<S>
       const unsigned taken = __ballot_sync(kFullMask, test.takes);
       if (s.lane == j) mark = taken;
       if constexpr (kAlpha) {
-        const unsigned were_cut = cuts ? __ballot_sync(kFullMask, test.takes && is_cut) : 0;
+        const unsigned were_cut = a.cuts ? __ballot_sync(kFullMask, test.takes && is_cut) : 0;
         if (s.lane == j) cut_mark = were_cut;
       }
       if (!__any_sync(kFullMask, open)) todo = 0;
     }
     if (own < end) {
       row[own] = mark;
-      if (kAlpha && cuts) cuts[s.warp * pairs + own] = cut_mark;
+      if (kAlpha && a.cuts) a.cuts[s.warp * a.pairs + own] = cut_mark;
     }
   }
   for (int64_t k = first + s.lane; k < end; k += kWarp) row[k] = 0;

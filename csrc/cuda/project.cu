@@ -34,20 +34,13 @@ template <class S> __global__ void __launch_bounds__(kThreads) backward_kernel(P
 }  // namespace
 
 template <class S> void project_forward(const ProjectForward<S>& a, Stream stream) {
-  const int64_t n = a.surfels.n;
-  if (!n) return;
-  BT_LAUNCH(forward_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, a);
+  BT_LAUNCH_EACH(forward_kernel<S>, a.surfels.n, kThreads, stream, a);
 }
 template <class S> void project_backward(const ProjectBackward<S>& a, Stream stream) {
-  const int64_t n = a.surfels.n;
-  if (!n) return;
-  BT_LAUNCH(backward_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, a);
+  BT_LAUNCH_EACH(backward_kernel<S>, a.surfels.n, kThreads, stream, a);
 }
 
-#define BT_INSTANTIATE(S)                                          \
-  template void project_forward(const ProjectForward<S>&, Stream); \
-  template void project_backward(const ProjectBackward<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(project_forward, ProjectForward)
+BT_INSTANTIATE(project_backward, ProjectBackward)
 
 }  // namespace bt::cuda

@@ -23,14 +23,12 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_
   const TileThread s = tile_thread(a.view.width);
   S sum[kImageChannels];
   for (int c = 0; c < kImageChannels; ++c) sum[c] = S(0);
-  const S behind =
-      mark_pairs<kAlpha>(a.view, a.alpha, a.pairs, a.surfel, a.tile_pairs, a.masks, a.cuts, s,
-                         [&](int64_t id, const S* g, const Fragment<T>& f, S weight) {
-                           const TexelPatch<S> patch(a.table, id);
-                           const Vec3<S> c = patch.color(weight, a.bound, plain(f.u), plain(f.v));
-                           const S color[3] = {c.x, c.y, c.z};
-                           add_blended<false>(weight, color, g[kBeta], S(0), static_cast<const S*>(nullptr), sum);
-                         });
+  const S behind = mark_pairs<kAlpha>(a, s, [&](int64_t id, const S* g, const Fragment<T>& f, S weight) {
+    const TexelPatch<S> patch(a.table, id);
+    const Vec3<S> c = patch.color(weight, a.bound, plain(f.u), plain(f.v));
+    const S color[3] = {c.x, c.y, c.z};
+    add_blended<false>(weight, color, g[kBeta], S(0), static_cast<const S*>(nullptr), sum);
+  });
   if (s.x >= a.view.width || s.y >= a.view.height) return;
   const int64_t pixel = int64_t(s.y) * a.view.width + s.x;
   for (int c = 0; c < kImageChannels; ++c) a.image[pixel * kImageChannels + c] = sum[c];
@@ -228,8 +226,8 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
           if constexpr (kAlpha)
             if (bits & kCut) of_texels[3] = alpha_vjp(AlphaPatch<S>(a.alpha, id), corners, sigma, gs, gu, gv);
         }
-        if (a.texel_sums)
-          add_to_corners(texel, corners, of_texels, int(threadIdx.x) % kWarp, Adder<S, false>{a.texel_sums});
+        if (a.step.sums)
+          add_to_corners(texel, corners, of_texels, int(threadIdx.x) % kWarp, Adder<S, false>{a.step.sums});
       }
       if (mine) {
         const int pixel = bits & kPixel;
@@ -281,8 +279,9 @@ template <class S> void rasterize_forward(const RasterizeForward<S>& a, Stream s
 
 template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream stream) {
   const Pairs& p = a.layout;
-  if (a.texel_sums) each_shown_texel(p, a.table, ClearTexel<S>{a.texel_sums}, stream);
-  fill_zero(a.dtexel_alpha, a.dtexel_alpha ? a.alpha.texels : 0, stream);
+  const TexelStep<S>& step = a.step;
+  if (step.sums) each_shown_texel(p, a.table, ClearTexel<S>{step.sums}, stream);
+  fill_zero(step.dalpha, step.dalpha ? a.alpha.texels : 0, stream);
   const auto run = a.alpha.values   ? backward_kernel<S, true, true>
                    : a.table.texels ? backward_kernel<S, false, true>
                                     : backward_kernel<S, false, false>;
@@ -290,16 +289,13 @@ template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
   sum_slots<Held<S>::kColors>(p, static_cast<const S*>(a.color_partial), StoreColorGradient<S>{a.table.base, a.dbase},
                               stream);
-  if (a.texel_sums) {
-    const MoveTexel<S, false> color = {a.texel_sums, {}, a.share, a.rate, a.moved, nullptr};
-    each_shown_texel(p, a.table, PutTexel<S>{color, a.dtexel_alpha}, stream);
+  if (step.sums) {
+    const MoveTexel<S, false> color = {step.sums, {}, step.share, step.rate, step.moved, nullptr};
+    each_shown_texel(p, a.table, PutTexel<S>{color, step.dalpha}, stream);
   }
 }
 
-#define BT_INSTANTIATE(S)                                              \
-  template void rasterize_forward(const RasterizeForward<S>&, Stream); \
-  template void rasterize_backward(const RasterizeBackward<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(rasterize_forward, RasterizeForward)
+BT_INSTANTIATE(rasterize_backward, RasterizeBackward)
 
 }  // namespace bt::cuda

@@ -2,7 +2,7 @@
 // shared memory once, filtered along rows, then along columns, each thread keeping its part of a column in registers.
 // At 88 bytes and about 400 operations per value for both passes, memory and arithmetic are about balanced on an H200;
 // pixels read twice, at tile rims, come from L2.
-#include "core/ssim.h"
+#include "core/training.h"
 #include "cuda/kernels.h"
 #include "cuda/warp.h"
 
@@ -187,10 +187,8 @@ template <class S> void ssim(const Ssim<S>& images, Stream stream) {
     fill_zero(da, int64_t(height) * width * channels, stream);
 }
 
-#define BT_INSTANTIATE(S)                                  \
-  template int64_t ssim_workspace<S>(int, int, int, bool); \
-  template void ssim(const Ssim<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template int64_t ssim_workspace<float>(int, int, int, bool);
+template int64_t ssim_workspace<double>(int, int, int, bool);
+BT_INSTANTIATE(ssim, Ssim)
 
 }  // namespace bt::cuda

@@ -2,8 +2,8 @@
 // or 0, for one vector reduction per texel (warp.h); or integers, for order-independent sums.
 #pragma once
 
-#include "cuda/exact_sums.h"
 #include "cuda/fragment_list.h"
+#include "cuda/warp.h"
 #include "ops/texel.h"
 
 namespace bt::cuda {
@@ -46,9 +46,7 @@ __global__ void __launch_bounds__(kTexelThreads) shown_texels_kernel(Pairs p, Te
 }
 template <class S, class F>
 void each_shown_texel(const Pairs& p, const TexelTiles<S>& tiles, const F& fn, Stream stream) {
-  if (p.surfels)
-    BT_LAUNCH((shown_texels_kernel<S, F>), dim3(unsigned(ceil_div(p.surfels * kWarp, kTexelThreads))),
-              dim3(kTexelThreads), 0, stream, p, tiles, fn);
+  BT_LAUNCH_EACH((shown_texels_kernel<S, F>), p.surfels * kWarp, kTexelThreads, stream, p, tiles, fn);
 }
 
 template <class S> struct ClearTexel {

@@ -23,12 +23,8 @@ struct MarkSpace {
         temp(arena.take<char>(temp_size)) {}
 };
 
-template <class S, bool kAlpha>
-__global__ void __launch_bounds__(kTileThreads)
-    mark_kernel(View<S> view, AlphaTiles<S> alpha, int64_t pairs, const int32_t* surfel, const int64_t* tile_pairs,
-                uint32_t* masks) {
-  mark_pairs<kAlpha>(view, alpha, pairs, surfel, tile_pairs, masks, static_cast<uint32_t*>(nullptr),
-                     tile_thread(view.width), [](int64_t, const S*, const Fragment<FastFloatOr<S>>&, S) {});
+template <class S, bool kAlpha> __global__ void __launch_bounds__(kTileThreads) mark_kernel(MarkedView<S> a) {
+  mark_pairs<kAlpha>(a, tile_thread(a.view.width), [](int64_t, const S*, const Fragment<FastFloatOr<S>>&, S) {});
 }
 
 // Pairs after those of the tiles have no masks.
@@ -143,16 +139,12 @@ int64_t trace_mark_workspace(int64_t pairs) {
 }
 
 template <class S> void trace_mark(const TraceMark<S>& a, Stream stream) {
-  const View<S>& v = a.view;
-  const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
+  const int64_t pairs = a.pairs, tiles = tiles_of(a.view.width, a.view.height);
   Arena arena(a.workspace.of(trace_mark_workspace(pairs)));
   const MarkSpace w(arena, pairs);
   const auto mark = a.alpha.values ? mark_kernel<S, true> : mark_kernel<S, false>;
-  if (pairs)
-    BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, v, a.alpha, pairs, a.surfel, a.tile_pairs,
-              a.masks);
-  BT_LAUNCH(size_kernel, dim3(unsigned(ceil_div(pairs + 1, kThreads))), dim3(kThreads), 0, stream, pairs,
-            a.tile_pairs + tiles, a.masks, w.counts);
+  if (pairs) BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, a);
+  BT_LAUNCH_EACH(size_kernel, pairs + 1, kThreads, stream, pairs, a.tile_pairs + tiles, a.masks, w.counts);
   exclusive_sum(w.counts, a.offsets, pairs + 1, w.temp, w.temp_size, stream);
 }
 
@@ -170,16 +162,10 @@ void masked_counts(const MaskedCounts<Pairs>& a, Stream stream) {
 }
 
 void select_fragments(const SelectPairs& a, Stream stream) {
-  const int64_t pairs = a.layout.pairs;
-  if (pairs)
-    BT_LAUNCH(select_kernel, dim3(unsigned(ceil_div(pairs, kThreads))), dim3(kThreads), 0, stream, a.layout, a.keep,
-              a.masks, a.counts);
+  BT_LAUNCH_EACH(select_kernel, a.layout.pairs, kThreads, stream, a.layout, a.keep, a.masks, a.counts);
 }
 
-#define BT_INSTANTIATE(S)                                \
-  template void trace_mark(const TraceMark<S>&, Stream); \
-  template void trace_fill(const TraceFill<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(trace_mark, TraceMark)
+BT_INSTANTIATE(trace_fill, TraceFill)
 
 }  // namespace bt::cuda

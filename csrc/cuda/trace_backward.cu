@@ -4,10 +4,8 @@
 // that sum in a register, 16 bytes per fragment. The long formulas need no order, so they run through the list one pair
 // at a time with all lanes busy (in the first pass two thirds would idle) and reduce once per pair. Gradients of alpha
 // texels are summed over neighbouring fragments with the same texels, then added in memory.
-#include "core/kernel.h"
-#include "cuda/fast_float.h"
 #include "cuda/kernels.h"
-#include "cuda/texel_alpha.h"
+#include "cuda/mark.h"
 #include "cuda/texel_sums.h"
 
 namespace bt::cuda {
@@ -38,25 +36,18 @@ __global__ void __launch_bounds__(kTileThreads)
   each_fragment_back<4>(p, s, load, use);
 }
 
-// Alpha texels, and where their gradients are added up; `texels` null: not at all.
-template <class S> struct AlphaGradient {
-  AlphaTiles<S> tiles;
-  S* texels;
-  ExactSums exact;
-};
-
 template <class S, bool kAlpha, bool kExact>
-__global__ void __launch_bounds__(kRunThreads)
-    surfel_kernel(const S* geom, S near, S rim, Pairs p, FragmentArrays<S> f, AlphaGradient<S> alpha, const S* dsigma,
-                  const S* duv, const S* ddepth, S* partial) {
+__global__ void __launch_bounds__(kRunThreads) surfel_kernel(TraceBackward<S, Pairs> a, ExactSums exact) {
   using T = FastFloatOr<S>;
+  const Pairs& p = a.fragments.layout;
+  const FragmentArrays<S>& f = a.fragments.f;
   const Run r = run(p);
   T d[kTraceSums], ax = T(S(0)), ay = T(S(0));
   BT_UNROLL
   for (int c = 0; c < kTraceSums; ++c) d[c] = T(S(0));
   S g[kGeom];
   const int64_t id = r.some ? int64_t(p.surfel[r.k]) : 0;
-  load_shape(geom + id * kGeom, g);
+  load_shape(a.view.geom + id * kGeom, g);
   const RowOf row_of(p.width);
   const int own = int(r.end - r.begin), most = max_(own, __shfl_xor_sync(kFullMask, own, kRunLanes));
   for (int at = r.lane; at - r.lane < most; at += kRunLanes) {
@@ -66,13 +57,13 @@ __global__ void __launch_bounds__(kRunThreads)
     S listed = S(0), gs = S(0), gu = S(0), gv = S(0), gz = S(0);
     if (mine) {
       pixel = f.pixel[i], listed = f.sigma[i];
-      if (dsigma) gs = dsigma[i];
-      if (duv) gu = duv[i], gv = duv[f.total + i];
-      if (ddepth) gz = ddepth[i];
+      if (a.dweight) gs = a.dsigma[i];
+      if (a.duv) gu = a.duv[i], gv = a.duv[f.total + i];
+      if (a.ddepth) gz = a.ddepth[i];
     }
     __syncwarp();  // all loads are issued before any is used: one wait for all
     if constexpr (kAlpha) {
-      const AlphaPatch<S> patch(alpha.tiles, id);
+      const AlphaPatch<S> patch(a.alpha, id);
       TexelCorners<S> corners = {};
       S v = S(0), dm[1] = {S(0)};
       if (mine && patch.textured()) v = f.uv[f.total + i];
@@ -81,15 +72,15 @@ __global__ void __launch_bounds__(kRunThreads)
         corners = patch.corners(f.uv[i], v);
         dm[0] = alpha_vjp(patch, corners, listed, gs, gu, gv);
       }
-      if (alpha.texels)
+      if (a.dtexel_alpha)
         add_to_corners(is_cut ? patch.first + corners.at[0] : int64_t(-1), corners, dm, int(threadIdx.x) % kWarp,
-                       adder<kExact>(alpha.texels, alpha.exact));
+                       adder<kExact>(a.dtexel_alpha, exact));
     }
     if (mine) {
       const int32_t y = row_of(pixel), x = pixel - y * p.width;
       T ddx, ddy;
-      fragment_vjp<S, T>(g, near, rim, T(pixel_centre<S>(x) - g[kCx]), T(pixel_centre<S>(y) - g[kCy]), T(listed), T(gs),
-                         T(gu), T(gv), T(gz), d, ddx, ddy);
+      fragment_vjp<S, T>(g, a.view.near, a.rim, T(pixel_centre<S>(x) - g[kCx]), T(pixel_centre<S>(y) - g[kCy]),
+                         T(listed), T(gs), T(gu), T(gv), T(gz), d, ddx, ddy);
       ax += abs_(ddx), ay += abs_(ddy);
     }
   }
@@ -98,7 +89,7 @@ __global__ void __launch_bounds__(kRunThreads)
   BT_UNROLL
   for (int c = 0; c < kTraceSums; ++c) sums[c] = plain(d[c]);
   const S sum = sum_over_run(sums, r.lane);
-  if (r.some) partial[int64_t(p.slot[r.k]) * kTraceSums + r.lane] = sum;
+  if (r.some) a.partial[int64_t(p.slot[r.k]) * kTraceSums + r.lane] = sum;
 }
 
 }  // namespace
@@ -108,27 +99,23 @@ template <class S> void trace_backward(const TraceBackward<S, Pairs>& a, Stream 
   const FragmentArrays<S>& f = a.fragments.f;
   if (a.dweight && f.total)
     BT_LAUNCH(dsigma_kernel<S>, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, p, f, a.dweight, a.dsigma);
-  const S* dsigma = a.dweight ? a.dsigma : nullptr;
   const int64_t texels = a.dtexel_alpha ? a.alpha.texels : 0;
-  const bool cuts = a.alpha.values && dsigma, exact = cuts && texels && a.exact_alpha;
-  AlphaGradient<S> alpha = {a.alpha, a.dtexel_alpha, {}};
+  const bool cuts = a.alpha.values && a.dweight, exact = cuts && texels && a.exact_alpha;
+  ExactSums sums;
   if (exact)
-    alpha.exact = begin_exact(a.exact_alpha, texels, static_cast<const FieldArrays<S>*>(nullptr), f.total, f.total,
-                              dsigma, stream);
+    sums = begin_exact(a.exact_alpha, texels, static_cast<const FieldArrays<S>*>(nullptr), f.total, f.total,
+                       static_cast<const S*>(a.dsigma), stream);
   else
     fill_zero(a.dtexel_alpha, texels, stream);
   const auto run = exact  ? surfel_kernel<S, true, true>
                    : cuts ? surfel_kernel<S, true, false>
                           : surfel_kernel<S, false, false>;
-  if (p.pairs)
-    BT_LAUNCH(run, run_blocks(p), dim3(kRunThreads), 0, stream, a.view.geom, a.view.near, a.rim, p, f, alpha, dsigma,
-              a.duv, a.ddepth, a.partial);
-  if (exact) end_exact(alpha.exact, texels, a.dtexel_alpha, stream);
+  if (p.pairs) BT_LAUNCH(run, run_blocks(p), dim3(kRunThreads), 0, stream, a, sums);
+  if (exact) end_exact(sums, texels, a.dtexel_alpha, stream);
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
 }
 
-#define BT_INSTANTIATE(S) template void trace_backward(const TraceBackward<S, Pairs>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template void trace_backward(const TraceBackward<float, Pairs>&, Stream);
+template void trace_backward(const TraceBackward<double, Pairs>&, Stream);
 
 }  // namespace bt::cuda

@@ -1,8 +1,8 @@
 // Losses, densification statistics and Adam of a training step; see training.h.
 #include <cmath>
 
-#include "core/adam.h"
 #include "core/common.h"
+#include "core/training.h"
 #include "cuda/kernels.h"
 #include "cuda/training.h"
 #include "cuda/warp.h"
@@ -186,7 +186,6 @@ template <class S> __global__ void __launch_bounds__(kThreads) statistics_kernel
   if (radius > a.max_radius[i]) a.max_radius[i] = radius;
 }
 
-dim3 blocks_for(int64_t n) { return dim3(unsigned(ceil_div(n, kThreads))); }
 int sum_blocks(int64_t n) { return int(min_(ceil_div(n, kThreads), int64_t(kMostSums))); }
 
 // Parameters of one launch; each has the blocks from first_block on.
@@ -256,7 +255,7 @@ template <class S> int64_t picture_workspace(int height, int width) {
 template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream) {
   const Picture<S>& p = a.picture;
   const PictureSpace<S> space = picture_space(p);
-  if (p.pixels()) BT_LAUNCH(show_kernel<S>, blocks_for(p.pixels()), dim3(kThreads), 0, stream, p, space);
+  BT_LAUNCH_EACH(show_kernel<S>, p.pixels(), kThreads, stream, p, space);
   ssim(Ssim<S>{p.height, p.width, 3, space.shown, space.wanted, space.similarity, space.dsimilarity, space.ssim},
        stream);
   const int blocks = sum_blocks(p.pixels());
@@ -277,7 +276,7 @@ template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, S
 }
 
 template <class S> void accumulate_statistics(const DensifyStatistics<S>& a, Stream stream) {
-  if (a.n) BT_LAUNCH(statistics_kernel<S>, blocks_for(a.n), dim3(kThreads), 0, stream, a);
+  BT_LAUNCH_EACH(statistics_kernel<S>, a.n, kThreads, stream, a);
 }
 
 template <class S> void adam(const AdamParameter<S>* parameters, int count, Stream stream) {
@@ -298,14 +297,13 @@ template <class S> void learn_exposure(const LearnExposure<S>& a, Stream stream)
   BT_LAUNCH(exposure_kernel<S>, dim3(1), dim3(kThreads), 0, stream, a);
 }
 
-#define BT_INSTANTIATE(S)                                                     \
-  template int64_t picture_workspace<S>(int, int);                            \
-  template void learn_exposure(const LearnExposure<S>&, Stream);              \
-  template void adam(const AdamParameter<S>*, int, Stream);                   \
-  template void picture_loss(const PictureLoss<S>&, Stream);                  \
-  template void picture_loss_backward(const PictureLossBackward<S>&, Stream); \
-  template void accumulate_statistics(const DensifyStatistics<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template int64_t picture_workspace<float>(int, int);
+template int64_t picture_workspace<double>(int, int);
+BT_INSTANTIATE(learn_exposure, LearnExposure)
+template void adam(const AdamParameter<float>*, int, Stream);
+template void adam(const AdamParameter<double>*, int, Stream);
+BT_INSTANTIATE(picture_loss, PictureLoss)
+BT_INSTANTIATE(picture_loss_backward, PictureLossBackward)
+BT_INSTANTIATE(accumulate_statistics, DensifyStatistics)
 
 }  // namespace bt::cuda

@@ -107,9 +107,7 @@ template <class S> int64_t count_view(const TrainingView<S>& a, Stream stream) {
   project_forward(ProjectForward<S>{a.surfels, a.viewmat, a.K, a.width, a.height, a.near, S(1), a.geom, a.frames,
                                     a.radii, a.broken},
                   stream);
-  if (n)
-    BT_LAUNCH(active_kernel<S>, dim3(unsigned(ceil_div(n, kThreads))), dim3(kThreads), 0, stream, n, a.radii,
-              s.of.active);
+  BT_LAUNCH_EACH(active_kernel<S>, n, kThreads, stream, n, a.radii, s.of.active);
   ViewColorForward<S> colors = {};
   colors.to = s.directions(), colors.colors.whole = a.colors, colors.out = s.of.base;
   view_color_forward(colors, stream);
@@ -121,9 +119,8 @@ template <class S> void draw_view(const DrawView<S>& a, Stream stream) {
   const Spaces<S> s(*a.view);
   const PairSpace<S> p = s.pairs(a);
   bin_fill(BinFill<S>{s.view(), s.of.order, s.of.slot_start, a.pairs, p.slot, p.surfel, p.tile_pairs, p.fill}, stream);
-  rasterize_forward(RasterizeForward<S>{s.view(), s.v.alpha, s.v.table, s.v.bound, a.pairs, p.surfel, p.tile_pairs,
-                                        p.masks, p.cuts, s.of.image, s.of.transmittance},
-                    stream);
+  const MarkedView<S> marked = {s.view(), s.v.alpha, a.pairs, p.surfel, p.tile_pairs, p.masks, p.cuts};
+  rasterize_forward(RasterizeForward<S>{marked, s.v.table, s.v.bound, s.of.image, s.of.transmittance}, stream);
   picture_loss(PictureLoss<S>{s.v.picture, s.v.photometric, s.v.falloff}, stream);
 }
 
@@ -135,23 +132,19 @@ template <class S> void differentiate_view(const DifferentiateView<S>& a, Stream
                         stream);
   const Pairs layout = {v.width, v.height, v.surfels.n,  a.drawn.pairs, p.surfel,        p.slot,
                         p.masks, nullptr,  p.tile_pairs, s.of.order,    s.of.slot_start, -1};
-  RasterizeBackward<S> r = {};
-  r.view = s.view(), r.rim = v.rim, r.alpha = v.alpha, r.table = v.table, r.bound = v.bound, r.layout = layout;
-  r.cuts = p.cuts, r.transmittance = s.of.transmittance, r.dimage = s.of.dimage;
-  r.share = a.share, r.rate = a.rate, r.moves = v.moves;
-  r.partial = p.partial, r.color_partial = p.color_partial, r.texel_sums = a.texel_sums;
-  r.dgeom = a.dgeom, r.absgrad = a.absgrad, r.dbase = s.of.dbase, r.moved = a.moved, r.dtexel_alpha = a.dtexel_alpha;
-  rasterize_backward(r, stream);
+  const RasterizeBackward<S> gradients = {
+      s.view(),    v.rim,   v.alpha,   v.table,         v.bound, layout,    p.cuts,     s.of.transmittance,
+      s.of.dimage, v.moves, p.partial, p.color_partial, a.dgeom, a.absgrad, s.of.dbase, a.step};
+  rasterize_backward(gradients, stream);
   view_color_backward(ViewColorBackward<S>{s.directions(), v.colors, s.of.dbase, a.dcolors, a.dmeans_color}, stream);
   project_backward(ProjectBackward<S>{v.surfels, v.viewmat, v.K, v.geom, a.dgeom, nullptr, a.out}, stream);
 }
 
-#define BT_INSTANTIATE(S)                                         \
-  template int64_t training_view_workspace<S>(int64_t, int, int); \
-  template int64_t count_view(const TrainingView<S>&, Stream);    \
-  template void draw_view(const DrawView<S>&, Stream);            \
-  template void differentiate_view(const DifferentiateView<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+template int64_t training_view_workspace<float>(int64_t, int, int);
+template int64_t training_view_workspace<double>(int64_t, int, int);
+template int64_t count_view(const TrainingView<float>&, Stream);
+template int64_t count_view(const TrainingView<double>&, Stream);
+BT_INSTANTIATE(draw_view, DrawView)
+BT_INSTANTIATE(differentiate_view, DifferentiateView)
 
 }  // namespace bt::cuda

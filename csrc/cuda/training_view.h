@@ -35,8 +35,7 @@ template <class S> struct TrainingView {
     colors.fields(r, surfels.n);
     table.tiles(r);
     alpha.fields(r, surfels.n);
-    if (table.n != surfels.n || (alpha.values && alpha.texels != table.texels))
-      r.refuse("the tiles belong to other surfels or other alphas");
+    check_tiles(r, table, alpha, surfels.n);
     picture.width = width, picture.height = height;
     picture.compared(r);
     r.wide("geom", geom, surfels.n * kGeom);
@@ -69,28 +68,21 @@ template <class S> struct DrawView {
 template <class S> void draw_view(const DrawView<S>& a, Stream stream);
 
 // Writes the gradients of both losses with respect to the surfels: `out` through the projection, dmeans_color [n, 3]
-// through the direction of the view colours, and dcolors; dgeom [n, kGeom] and absgrad [n, 2]; dcorrection and
-// dtexel_alpha unless null. Texels move as in RasterizeBackward.
+// through the direction of the view colours, and dcolors; dgeom [n, kGeom] and absgrad [n, 2]; dcorrection unless null.
 template <class S> struct DifferentiateView {
   DrawView<S> drawn;
-  const S *dphotometric, *dfalloff, *share;
-  S rate;
-  S *moved, *texel_sums, *dtexel_alpha, *dcorrection, *dgeom, *absgrad, *dmeans_color;
+  const S *dphotometric, *dfalloff;
+  TexelStep<S> step;
+  S *dcorrection, *dgeom, *absgrad, *dmeans_color;
   SurfelGradients<S> out;
   ViewColorArrays<S> dcolors;
 
   template <class R> void fields(R& r) {
     drawn.fields(r);
     const TrainingView<S>& v = *drawn.view;
-    const int64_t n = v.surfels.n, texels = v.table.texels;
+    const int64_t n = v.surfels.n;
     r.arrays(1, "dphotometric", dphotometric, "dfalloff", dfalloff);
-    r.maybe("share", share, texels);
-    r.number("rate", rate);
-    r.maybe("moved", moved, 3 * texels);
-    r.maybe("texel_work", texel_sums, 4 * texels);
-    r.maybe("dtexel_alpha", dtexel_alpha, v.alpha.values ? texels : 0);
-    if (moved && !share) r.refuse("texels move by a share of each");
-    if ((moved || dtexel_alpha) && !texel_sums) r.refuse("gradients of texels need working memory");
+    step.fields(r, v.table.texels, v.alpha.values);
     r.maybe("dcorrection", dcorrection, v.picture.corrected);
     r.array("dgeom", dgeom, n * kGeom);
     r.array("absgrad", absgrad, n * 2);

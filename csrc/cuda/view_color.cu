@@ -10,48 +10,40 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 128;
 
-template <class S, class ViewColor, int kTerms> struct WholeColor {
-  ViewColorArrays<const S> p;
-  __device__ Vec3<S> operator()(int64_t i, Vec3<S> d) const {
-    return view_color<ViewColor>(kTerms ? kTerms : p.terms, p, i, d);
-  }
-};
-// A single-colour surfel reads 20 bytes; each term 24 more (sv).
-template <class S> struct LeanColor {
-  LeanColors<S> p;
-  __device__ Vec3<S> operator()(int64_t i, Vec3<S> d) const { return view_color(p, i, d); }
-};
-
-template <class S, class Color>
-__global__ void __launch_bounds__(kThreads)
-    forward_kernel(int64_t n, Color color, const S* __restrict__ means, const double* __restrict__ center,
-                   const uint8_t* __restrict__ active, S* __restrict__ out) {
+// kTerms: the number of terms, 0: that of the colours; without a kind the colours are lean: a single-colour surfel
+// reads 20 bytes; each term 24 more (sv).
+template <class S, class ViewColor, int kTerms>
+__global__ void __launch_bounds__(kThreads) forward_kernel(ViewColorForward<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= n) return;
+  if (i >= a.to.n) return;
   Vec3<S> c = {S(0), S(0), S(0)};
-  if (active[i]) c = color(i, view_direction(means + 3 * i, center).n);
-  store3(out + 3 * i, c);
+  if (a.to.active[i]) {
+    const Vec3<S> d = view_direction(a.to.means + 3 * i, a.to.center).n;
+    if constexpr (std::is_void_v<ViewColor>)
+      c = view_color(a.colors.lean, i, d);
+    else
+      c = view_color<ViewColor>(kTerms ? kTerms : a.colors.whole.terms, a.colors.whole, i, d);
+  }
+  store3(a.out + 3 * i, c);
 }
 
 template <class S, class ViewColor, int kTerms>
-__global__ void __launch_bounds__(kThreads)
-    backward_kernel(int64_t n, ViewColorArrays<const S> p, const S* __restrict__ means,
-                    const double* __restrict__ center, const uint8_t* __restrict__ active, const S* __restrict__ dout,
-                    ViewColorArrays<S> dp, S* __restrict__ dmeans) {
+__global__ void __launch_bounds__(kThreads) backward_kernel(ViewColorBackward<S> a) {
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  if (i >= n) return;
-  const int K = kTerms ? kTerms : p.terms;
-  if (!active[i]) {
+  if (i >= a.to.n) return;
+  const int K = kTerms ? kTerms : a.colors.terms;
+  if (!a.to.active[i]) {
     const ViewColorWidths w = ViewColor::widths(K);
-    for (int k = 0; k < w.a; ++k) dp.a[w.a * i + k] = S(0);
-    for (int k = 0; k < w.b; ++k) dp.b[w.b * i + k] = S(0);
-    for (int k = 0; k < w.c; ++k) dp.c[w.c * i + k] = S(0);
-    store3(dmeans + 3 * i, Vec3<S>{S(0), S(0), S(0)});
+    const ViewColorRow<S> none = a.dcolors.row(w, i);
+    for (int k = 0; k < w.a; ++k) none.a[k] = S(0);
+    for (int k = 0; k < w.b; ++k) none.b[k] = S(0);
+    for (int k = 0; k < w.c; ++k) none.c[k] = S(0);
+    store3(a.dmeans + 3 * i, Vec3<S>{S(0), S(0), S(0)});
     return;
   }
-  const Unit<S> d = view_direction(means + 3 * i, center);
-  const Vec3<S> dd = view_color_vjp<ViewColor>(K, p, i, d.n, load3(dout + 3 * i), dp);
-  store3(dmeans + 3 * i, normalize_vjp(d, dd));
+  const Unit<S> d = view_direction(a.to.means + 3 * i, a.to.center);
+  const Vec3<S> dd = view_color_vjp<ViewColor>(K, a.colors, i, d.n, load3(a.dout + 3 * i), a.dcolors);
+  store3(a.dmeans + 3 * i, normalize_vjp(d, dd));
 }
 
 // Calls f with the kind's struct, and its preset's number of terms, for unrolled loops, or 0 for any other.
@@ -67,33 +59,24 @@ template <class F> void dispatch(int kind, int terms, F&& f) {
 }  // namespace
 
 template <class S> void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
-  const Directions<S>& to = a.to;
-  if (!to.n) return;
-  const auto write = [&](auto color) {
-    const auto kernel = forward_kernel<S, decltype(color)>;
-    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, color, to.means,
-              to.center, to.active, a.out);
-  };
-  if (a.colors.lean.base) return write(LeanColor<S>{a.colors.lean});
+  if (a.colors.lean.base) {
+    BT_LAUNCH_EACH((forward_kernel<S, void, 0>), a.to.n, kThreads, stream, a);
+    return;
+  }
   dispatch(a.colors.whole.kind, a.colors.whole.terms, [&](auto kind, auto terms) {
-    write(WholeColor<S, decltype(kind), decltype(terms)::value>{a.colors.whole});
+    const auto kernel = forward_kernel<S, decltype(kind), decltype(terms)::value>;
+    BT_LAUNCH_EACH(kernel, a.to.n, kThreads, stream, a);
   });
 }
 
 template <class S> void view_color_backward(const ViewColorBackward<S>& a, Stream stream) {
-  const Directions<S>& to = a.to;
-  if (!to.n) return;
   dispatch(a.colors.kind, a.colors.terms, [&](auto kind, auto terms) {
     const auto kernel = backward_kernel<S, decltype(kind), decltype(terms)::value>;
-    BT_LAUNCH(kernel, dim3(unsigned(ceil_div(to.n, kThreads))), dim3(kThreads), 0, stream, to.n, a.colors, to.means,
-              to.center, to.active, a.dout, a.dcolors, a.dmeans);
+    BT_LAUNCH_EACH(kernel, a.to.n, kThreads, stream, a);
   });
 }
 
-#define BT_INSTANTIATE(S)                                               \
-  template void view_color_forward(const ViewColorForward<S>&, Stream); \
-  template void view_color_backward(const ViewColorBackward<S>&, Stream);
-BT_INSTANTIATE(float)
-BT_INSTANTIATE(double)
+BT_INSTANTIATE(view_color_forward, ViewColorForward)
+BT_INSTANTIATE(view_color_backward, ViewColorBackward)
 
 }  // namespace bt::cuda

@@ -1,7 +1,7 @@
 // Arguments of view colours and SSIM.
 #pragma once
 
-#include "core/adam.h"
+#include "core/training.h"
 #include "core/view_color.h"
 #include "ops/arguments.h"
 

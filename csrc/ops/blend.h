@@ -1,7 +1,6 @@
 // Arguments of shading and blending in one pass over a fragment list.
 #pragma once
 
-#include "ops/texel.h"
 #include "ops/visibility.h"
 
 namespace bt {

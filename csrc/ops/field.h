@@ -11,7 +11,7 @@ constexpr int kMlpWeights = kInputs * kWidth + kWidth * kWidth + kWidth * 3;  //
 // (132).
 constexpr int kMostBlocks = 528;
 
-// Sizes in int64 of ExactRange (cuda/exact_sums.h), and of exact sums of `entries` numbers.
+// Sizes in int64 of ExactRange (cuda/warp.h), and of exact sums of `entries` numbers.
 constexpr int64_t kExactRange = 2;
 constexpr int64_t exact_size(int64_t entries) { return entries + kExactRange; }
 

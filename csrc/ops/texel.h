@@ -1,21 +1,19 @@
-// Arguments of texels, and the working memory of their gradients.
+// Arguments of texels, and the working memory of their gradients; alpha texels, the alpha of a fragment, and its
+// vector-Jacobian product.
 #pragma once
 
-#include "core/shading.h"
+#include "core/blend.h"
 #include "core/texel.h"
 #include "ops/arguments.h"
 #include "ops/field.h"
 
 namespace bt {
 
-// Texels of all tiles in one list, u fastest: tile i of r_u x r_v texels starts at first[i]; 0, 0 = no tile.
-template <class S> struct TexelTiles {
+// Texels of all tiles.
+template <class S> struct TexelTiles : Tiles<S> {
   int64_t n, texels;
-  const int64_t* first;  // [n], in texels
-  const int32_t* size;   // [n, 2]
-  const S* extent;       // [n] half side of the tile, scale units
-  const S* base;         // [n, 3] f_view
-  const S* values;       // [texels, 3]
+  const S* base;    // [n, 3] f_view
+  const S* values;  // [texels, 3]
 
   template <class R> void fields(R& r) {
     tiles(r);
@@ -23,37 +21,26 @@ template <class S> struct TexelTiles {
   }
   // All but the view colours.
   template <class R> void tiles(R& r) {
-    r.rows("first", first, n, 1);
-    r.array("size", size, 2 * n);
-    r.array("extent", extent, n);
+    r.rows("first", this->first, n, 1);
+    Tiles<S>::fields(r, n);
     r.rows("texels", values, texels, 3);
   }
 };
 // Texels of one surfel.
-template <class S> struct TexelPatch {
-  const int32_t* size;  // r_u, r_v; 0, 0 = no tile
-  const S* tile;        // its texels
-  int64_t first;        // index of the first in TexelTiles
-  S extent;
+template <class S> struct TexelPatch : TilePatch<S, 3> {
   Vec3<S> view;  // the colour without residual
 
   BT_HD TexelPatch(const TexelTiles<S>& tiles, int64_t id)
-      : size(tiles.size + 2 * id),
-        tile(tiles.values + 3 * tiles.first[id]),
-        first(tiles.first[id]),
-        extent(tiles.extent[id]),
-        view(view_base(load3(tiles.base + 3 * id))) {}
-  BT_HD bool textured() const { return size[0] > 0; }
-  BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
+      : TilePatch<S, 3>(tiles, tiles.values, id), view(view_base(load3(tiles.base + 3 * id))) {}
   // Computes the colour of a fragment; texels count from the weight `bound` on.
   BT_HD Vec3<S> color(S weight, S bound, S u, S v) const {
     TexelSlopes<S> none;
-    return weight >= bound && textured() ? color(corners(u, v), false, none) : view;
+    return weight >= bound && this->textured() ? color(this->corners(u, v), false, none) : view;
   }
   BT_HD Vec3<S> color(const TexelCorners<S>& at, bool moves, TexelSlopes<S>& slopes) const {
     Vec3<S> t[4];
-    load_corners(tile, at, t);
-    if (moves) slopes = texel_slopes(t, at, size, extent);
+    load_corners(this->tile, at, t);
+    if (moves) slopes = texel_slopes(t, at, this->size, this->extent);
     return shaded(view, texel_mix(t, at.weight));
   }
 };
@@ -71,6 +58,62 @@ template <class S> struct TexelWork {
       r.work("texel_work", sums, 4 * texels);
   }
 };
+
+// Alpha texels: the sigma of a fragment whose weight would be at least `bound` is multiplied by the bilinear fetch at
+// (u, v) and clamped again; the last bit of its listed v is then 1, else 0. Null `values`: none.
+template <class S> struct AlphaTiles : Tiles<S> {
+  int64_t texels;
+  const S* values;  // [texels], from 0 to 2
+  S bound;          // fragments of smaller weight keep their sigma
+
+  template <class R> void fields(R& r, int64_t n) {
+    values = nullptr, bound = 0;
+    if (!r.has("texel_alpha")) return;
+    Tiles<S>::fields(r, n);
+    r.rows("texel_alpha", values, texels, 1);
+    r.number("alpha_bound", bound);
+  }
+};
+
+// Alpha texels of one surfel.
+template <class S> struct AlphaPatch : TilePatch<S, 1> {
+  BT_HD AlphaPatch(const AlphaTiles<S>& tiles, int64_t id) : TilePatch<S, 1>(tiles, tiles.values, id) {}
+  // Fetches m, exactly 1 between texels of 1, and the four texels.
+  BT_HD S fetch(const TexelCorners<S>& at, S (&t)[4]) const {
+    BT_UNROLL
+    for (int k = 0; k < 4; ++k) t[k] = this->tile[at.at[k]];
+    return texel_lerp(t, at.fx, at.fy);
+  }
+};
+
+template <class R, class S>
+void check_tiles(R& r, const TexelTiles<S>& table, const AlphaTiles<S>& alpha, int64_t surfels) {
+  if (table.n != surfels || (alpha.values && alpha.texels != table.texels))
+    r.refuse("the tiles belong to other surfels or other alphas");
+}
+
+// Computes the gradients of a fragment's alpha factor: replaces gs, the gradient of the listed sigma, and the listed
+// sigma by those of the kernel's, adds to gu and gv, and returns the gradient of m. t: the four texels.
+template <class S, class T>
+BT_HD T alpha_vjp(const AlphaPatch<S>& patch, const T (&t)[4], const TexelAxis<T>& x, const TexelAxis<T>& y, T& listed,
+                  T& gs, T& gu, T& gv) {
+  const T m = texel_lerp(t, x.fraction, y.fraction), sigma = abs_(listed), zero = T(S(0));
+  // clamped values pass no gradient; m may round differently than when the fragment was written
+  const MaskOf<T> moves = sigma < T(S(kAlphaMax)), uncut_moves = moves & (sigma < m * T(S(kAlphaMax * (1 - 1e-6))));
+  const T dm = select(moves, gs * sigma / m, zero);
+  gu += select(x.inside, dm * T(texel_density(patch.size[0], patch.extent)) * texel_slope_u(t, y.fraction), zero);
+  gv += select(y.inside, dm * T(texel_density(patch.size[1], patch.extent)) * texel_slope_v(t, x.fraction), zero);
+  gs = select(uncut_moves, gs * m, zero);
+  listed = listed / m;
+  return dm;
+}
+template <class S>
+BT_HD S alpha_vjp(const AlphaPatch<S>& patch, const TexelCorners<S>& at, S& listed, S& gs, S& gu, S& gv) {
+  S t[4];
+  patch.fetch(at, t);
+  const TexelAxis<S> x = {S(0), at.fx, at.inside_u}, y = {S(0), at.fy, at.inside_v};
+  return alpha_vjp(patch, t, x, y, listed, gs, gu, gv);
+}
 
 // Channels of a baked image on the CPU: rgb, alpha; with maps those of BlendForward.
 constexpr int kBakedChannels = 4;

@@ -1,11 +1,7 @@
 // Arguments of projection and tracing.
 #pragma once
 
-#include "core/blend.h"
-#include "core/surfel.h"
-#include "ops/arguments.h"
-#include "ops/field.h"
-#include "ops/texel_alpha.h"
+#include "ops/texel.h"
 
 namespace bt {
 

@@ -135,7 +135,7 @@ class ListedPairs(NamedTuple):
 
 def listed_pairs(workspace: Workspace, surfels: int, views: int, width: int, height: int) -> ListedPairs:
     """Read the lists of the latest frame (without normals) from the working memory (`lay_out` of
-    csrc/cuda/baked_frame.cu), to the CPU."""
+    csrc/cuda/baked_list.cu), to the CPU."""
     assert workspace.memory is not None
     memory, at = workspace.memory.cpu(), 256
     tiles, rows, slots = tiles_of(views, width, height), surfels * views, workspace.slots

@@ -54,7 +54,7 @@ def test_large_surfels(count: int, device: torch.device, cpu) -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, device: torch.device, cpu) -> None:
-    """The single-precision bounds (core/plane_bounds.h) give the same fragments as the CPU's double ones."""
+    """The single-precision bounds (core/footprint.h) give the same fragments as the CPU's double ones."""
     case = random_scene(150, 100 + seed, width=72, height=56)
     g = torch.Generator().manual_seed(seed)
     case.params["log_scales"] += 2.0 * torch.randn(150, 2, generator=g, dtype=torch.float64)

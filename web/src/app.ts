@@ -5,23 +5,20 @@ import type { Vec3 } from './bundle/manifest';
 import type { Depths, DrawOptions, Renderer } from './render/renderer';
 import type { Show } from './render/programs';
 import { Pace, type Screen } from './render/screen';
-import { download, element, onClick, press, pressed, writing } from './ui/dom';
+import { download, element, onClick, press, pressed, toggle, writing } from './ui/dom';
 import { CropPanel } from './ui/crop_panel';
 import { MeasurePanel } from './ui/measure_panel';
-import { NotesFile } from './ui/notes_file';
 import { NotesPanel } from './ui/notes_panel';
 import { endPoster, notify, showError, stopped } from './ui/pages';
 import { bindPanels } from './ui/panels';
 import { PathPanel } from './ui/path_panel';
-import { Picker } from './ui/picker';
-import type { Stage } from './ui/stage';
-import { type CaptureCamera, commonTarget, correctionAt, parseCameras } from './view/cameras';
+import { NotesFile, Picker, type Stage } from './ui/stage';
+import { type CaptureCamera, commonTarget, correctionAt, extentOf, firstPose, parseCameras } from './view/cameras';
 import { Controls, type Mode } from './view/controls';
 import type { Notes } from './view/notes';
 import { Flight } from './view/path';
 import { DEFAULT_LENS, type Lens, type Pose, View, moved } from './view/pose';
 import { type Shared, type Viewpoint, fromHash, toHash } from './view/share';
-import { extentOf, firstPose } from './view/start';
 import { length, subtract, unit } from './view/vector';
 
 const MOVING_LAYERS = 4; // batches per frame while the camera moves, and at rest
@@ -314,10 +311,8 @@ export class App implements Stage {
   }
 
   private toggle(id: string): boolean {
-    const now = !pressed(element(id));
-    press(element(id), now);
     this.changed();
-    return now;
+    return toggle(id);
   }
 
   private setMode(mode: Mode): void {

@@ -1,6 +1,6 @@
 import { describe, expect, it } from 'vitest';
 import type { Vec3 } from '../src/bundle/manifest';
-import { edgesOf } from '../src/ui/lines';
+import { edgesOf } from '../src/ui/stage';
 import { lengthText } from '../src/ui/measure_panel';
 import type { Box } from '../src/view/crop';
 import { View, lookAt } from '../src/view/pose';

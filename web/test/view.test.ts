@@ -1,10 +1,9 @@
 import { describe, expect, it } from 'vitest';
 import type { Vec3 } from '../src/bundle/manifest';
-import { commonTarget, correctionAt, parseCameras } from '../src/view/cameras';
+import { commonTarget, correctionAt, firstPose, parseCameras } from '../src/view/cameras';
 import { Pace } from '../src/render/screen';
 import { DEFAULT_LENS, View, look, lookAt, moved, orbit, rolled } from '../src/view/pose';
 import { fromHash, toHash } from '../src/view/share';
-import { firstPose } from '../src/view/start';
 import { partOf, samplingOf, sizeOf } from '../src/view/size';
 import { dot, length, subtract } from '../src/view/vector';
 import { SURFEL_WORDS, WORD } from '../src/bundle/tables';

@@ -1,5 +1,5 @@
 // Screen rectangles that bound a surfel: the level set sigma = 1/255 of the kernel and of the low pass. As
-// core/plane_bounds.h, but along the axes of the surfel's image, as a rasterizer draws any rectangle: a long thin
+// core/footprint.h, but along the axes of the surfel's image, as a rasterizer draws any rectangle: a long thin
 // surfel then costs only its own area.
 
 struct Rectangle {
@@ -47,7 +47,7 @@ fn finish(center: vec2f, axis: vec2f, low: vec2f, high: vec2f) -> Rectangle {
   return Rectangle(true, axis, center + axis * middle.x + vec2f(-axis.y, axis.x) * middle.y, half_size);
 }
 
-// Returns true if the visible part of a disc lies beyond a border of the image; core/outline.h.
+// Returns true if the visible part of a disc lies beyond a border of the image; core/bounds.h.
 fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
   let off = along - border * c;
   let far = abs(border);

@@ -7,51 +7,6 @@ export type ViewKind = keyof typeof LEAN_WIDTH;
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
 export type Vec3 = [number, number, number];
 
-// Description of surfels.bin.
-export interface CompactSurfels {
-  frame: { center: Vec3; scale: number; low: Vec3 }; // of the positions
-  columns: Column[];
-}
-
-// Description of texels.bin.
-export interface CodedTexels {
-  texels: number;
-  step: number;
-  pageWidth: number;
-  pageRows: number;
-  columns: Column[];
-  surfelBytes: number; // of surfels.bin
-}
-
-export interface Atlas {
-  format: AtlasFormat | 'dct';
-  width: number;
-  height: number;
-  layers: number;
-  extent: number;
-  offset: number;
-  scale: number;
-  alphaScale: number; // a texel's alpha times this multiplies sigma; 0: opaque scene
-  coded: CodedTexels | null; // format dct
-}
-
-export interface Manifest {
-  version: string;
-  count: number;
-  viewColor: ViewKind;
-  terms: number | null;
-  compact: CompactSurfels | null; // if in surfels.bin
-  atlas: Atlas | null;
-  near: number;
-  weightBound: number;
-  photographed: Float32Array | null; // rows x, y, z, pixels per unit of length
-  background: Vec3;
-  bounds: { min: Vec3; max: Vec3 };
-  up: Vec3 | null;
-  metres: number | null; // per unit of the scene
-  files: Map<string, { bytes: number; sha256: string }>;
-}
-
 type Json = Record<string, unknown>;
 
 // Reads an object of bundle.json; the ranges of its numbers are those of `name` in RANGES.
@@ -139,25 +94,29 @@ function columns(r: Reader): Column[] {
   }));
 }
 
-function compact(r: Reader): CompactSurfels {
+// Reads the description of surfels.bin; the frame is that of the positions.
+function compact(r: Reader) {
   const frame = r.part('frame');
   const [center, scale, low] = [frame.point('center'), frame.number('scale'), frame.point('low')];
   return { frame: { center, scale, low }, columns: columns(r) };
 }
+export type CompactSurfels = ReturnType<typeof compact>;
 
-function texels(r: Reader, surfelBytes: number): CodedTexels {
+// Reads the description of texels.bin.
+function texels(r: Reader, surfelBytes: number) {
   return {
     texels: r.whole('texels'),
     step: r.number('step'),
     pageWidth: r.whole('page_width'),
     pageRows: r.whole('page_rows'),
     columns: columns(r),
-    surfelBytes,
+    surfelBytes, // of surfels.bin
   };
 }
+export type CodedTexels = ReturnType<typeof texels>;
 
-function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
-  const format = r.choice('format', isCompact ? ['dct'] : ['bc7', 'uint8', 'fp16']);
+function atlas(r: Reader, isCompact: boolean, surfelBytes: number) {
+  const format: AtlasFormat | 'dct' = r.choice('format', isCompact ? ['dct'] : ['bc7', 'uint8', 'fp16']);
   return {
     format,
     width: r.whole('width'),
@@ -166,10 +125,11 @@ function atlas(r: Reader, isCompact: boolean, surfelBytes: number): Atlas {
     extent: r.has('extent') ? r.number('extent') : EXTENT,
     offset: r.number('offset'),
     scale: r.number('scale'),
-    alphaScale: r.has('alpha_scale') ? r.number('alpha_scale') : 0,
-    coded: isCompact ? texels(r, surfelBytes) : null,
+    alphaScale: r.has('alpha_scale') ? r.number('alpha_scale') : 0, // times a texel's alpha, of sigma; 0: opaque scene
+    coded: isCompact ? texels(r, surfelBytes) : null, // format dct
   };
 }
+export type Atlas = ReturnType<typeof atlas>;
 
 // Reads points of the scene with the pixels per unit of length of their photographs.
 function points(r: Reader): Float32Array {
@@ -190,7 +150,7 @@ function points(r: Reader): Float32Array {
   return found.every(good) ? found : refuse();
 }
 
-export function parseManifest(text: string): Manifest {
+export function parseManifest(text: string) {
   let json: unknown;
   try {
     json = JSON.parse(text);
@@ -235,15 +195,16 @@ export function parseManifest(text: string): Manifest {
     count: surfels.whole('count'),
     viewColor: surfels.choice('view_color', Object.keys(LEAN_WIDTH) as ViewKind[]),
     terms: surfels.has('terms') || isCompact ? surfels.whole('terms') : null,
-    compact: isCompact ? compact(surfels) : null,
+    compact: isCompact ? compact(surfels) : null, // if in surfels.bin
     atlas: texture,
     near: render.number('near'),
     weightBound: render.number('weight_bound'),
-    photographed: render.has('photographed') ? points(render) : null,
+    photographed: render.has('photographed') ? points(render) : null, // rows x, y, z, pixels per unit of length
     background: render.point('background'),
     bounds: { min: bounds.point('min'), max: bounds.point('max') },
     up: world?.has('up') ? world.point('up') : null,
-    metres: world?.has('metres_per_unit') ? world.number('metres_per_unit') : null,
+    metres: world?.has('metres_per_unit') ? world.number('metres_per_unit') : null, // per unit of the scene
     files,
   };
 }
+export type Manifest = ReturnType<typeof parseManifest>;

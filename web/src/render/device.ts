@@ -5,14 +5,7 @@ const NEEDS =
   'Chrome and Edge from 113, Safari from 26 and Firefox from 141 have it. Update the browser and the graphics driver, ' +
   'and look whether hardware acceleration is switched on. Pages need https, or an address on this machine.';
 
-export interface Graphics {
-  device: GPUDevice;
-  blocks: boolean; // BC7 textures
-  floats: boolean; // rgba32float can be blended and filtered
-  software: boolean; // software adapter
-}
-
-export async function openDevice(): Promise<Graphics> {
+export async function openDevice() {
   const gpu = (navigator as Partial<Navigator>).gpu;
   if (!gpu) throw new NoGraphics('This browser has no WebGPU', 'The viewer draws with WebGPU.', NEEDS);
   const adapter = await gpu.requestAdapter({ powerPreference: 'high-performance' });
@@ -31,11 +24,12 @@ export async function openDevice(): Promise<Graphics> {
   });
   return {
     device,
-    blocks: features.includes(wanted[0]),
-    floats: features.includes(wanted[1]) && features.includes(wanted[2]),
+    blocks: features.includes(wanted[0]), // BC7 textures
+    floats: features.includes(wanted[1]) && features.includes(wanted[2]), // rgba32float can be blended and filtered
     software: adapter.info.isFallbackAdapter || /swiftshader|llvmpipe/i.test(`${architecture} ${name} ${description}`),
   };
 }
+export type Graphics = Awaited<ReturnType<typeof openDevice>>;
 
 const DRIVER = 'Reload the page. If it happens again, update the browser and the graphics driver.';
 

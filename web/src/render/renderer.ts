@@ -2,7 +2,7 @@
 import type { Vec3 } from '../bundle/manifest';
 import { FRAME, FRAME_BYTES } from '../bundle/tables';
 import type { View } from '../view/pose';
-import { type Part, type Sampling, isFar, partOf, samplingOf, sizeOf } from '../view/size';
+import { type Part, isFar, partOf, samplingOf, sizeOf } from '../view/size';
 import type { Graphics } from './device';
 import { type Programs, SHOW, type Show, type TargetFormat } from './programs';
 import { type SceneOnDevice, STRIDE, group } from './scene';
@@ -95,7 +95,7 @@ export class Renderer {
   }
 
   // Chooses the samples per pixel, more than one only at rest, and of a far view the part where surfels can be seen.
-  private samplingOf(view: View, options: DrawOptions): [Sampling, Part] {
+  private samplingOf(view: View, options: DrawOptions): [ReturnType<typeof samplingOf>, Part] {
     const whole: Part = [0, 0, view.width, view.height];
     const { info, surfels } = this.scene;
     if (!info.photographed?.length) return [{ samples: 1, photoPixel: 1 }, whole];

@@ -1,17 +1,14 @@
 // Crop of the scene by a box and a floor, and boxes around floaters that are hidden.
 import type { Vec3 } from '../bundle/manifest';
 import type { Surfels } from '../bundle/surfels';
+import type { extentOf } from '../view/cameras';
 import { type Box, type Cropping, crops, keptOf } from '../view/crop';
 import { MOST_HIDDEN } from '../view/notes';
 import type { View } from '../view/pose';
 import { axesOf, exponential, product, uprightQuat } from '../view/rotation';
 import { add, dot, subtract, times } from '../view/vector';
-import { button, element, make, onClick, press, pressed, writing } from './dom';
-import { Lines, edgesOf } from './lines';
-import type { NotesFile } from './notes_file';
-import { notify } from './pages';
-import type { Picker } from './picker';
-import type { Stage } from './stage';
+import { button, element, make, onClick, press, pressed, toggle, writing } from './dom';
+import { Lines, type NotesFile, type Picker, type Stage, edgesOf, isFull } from './stage';
 
 type Mode = 'box' | 'floor' | 'hide';
 const MODES: Mode[] = ['box', 'floor', 'hide'];
@@ -21,12 +18,6 @@ const REACH = 2; // of the sliders of a crop, in sizes of the scene
 const FLOATER = 0.05; // half side of a new box around a floater
 const BELOW = 0.01; // distance of a new floor below the clicked point
 const THINNEST = 1e-4; // half side of a box; all in sizes of the scene
-
-export interface Extent {
-  middle: Vec3;
-  size: number;
-  up: Vec3;
-}
 
 export class CropPanel {
   private mode: Mode | null = null;
@@ -43,7 +34,7 @@ export class CropPanel {
     private readonly picker: Picker,
     private readonly file: NotesFile,
     private readonly surfels: Surfels,
-    private readonly extent: Extent,
+    private readonly extent: ReturnType<typeof extentOf> & { up: Vec3 },
   ) {
     this.anchor = extent.middle;
     this.before = this.copy();
@@ -56,7 +47,7 @@ export class CropPanel {
       this.changed();
     });
     onClick('apply-crop', () => {
-      press(element('apply-crop'), !pressed(element('apply-crop')));
+      toggle('apply-crop');
       this.apply();
     });
     addEventListener('keydown', (e) => {
@@ -130,11 +121,7 @@ export class CropPanel {
   }
 
   private hideSelected(): void {
-    if (!this.selected) return;
-    if (this.all.hidden.length >= MOST_HIDDEN) {
-      notify(`There are ${MOST_HIDDEN} hidden boxes, as many as there can be.`);
-      return;
-    }
+    if (!this.selected || isFull(this.all.hidden, MOST_HIDDEN, 'hidden boxes')) return;
     this.all.hidden.push(this.selected);
     this.changed();
     this.choose('hide');

@@ -8,6 +8,12 @@ export function element<T extends HTMLElement = HTMLElement>(id: string): T {
 export const press = (button: HTMLElement, on: boolean): void => button.setAttribute('aria-pressed', String(on));
 export const pressed = (button: HTMLElement): boolean => button.getAttribute('aria-pressed') === 'true';
 
+// Presses or releases a button; returns whether it is pressed then.
+export function toggle(id: string): boolean {
+  press(element(id), !pressed(element(id)));
+  return pressed(element(id));
+}
+
 // Creates an element with properties and children.
 export function make<K extends keyof HTMLElementTagNameMap>(
   tag: K,

@@ -4,11 +4,8 @@ import { LONGEST_NAME, LONGEST_UNIT, MOST_MEASURES, type Measure, type Unit, cle
 import type { View } from '../view/pose';
 import { add, length, subtract, times } from '../view/vector';
 import { button, element, make, onClick, pressed, writing } from './dom';
-import { type Line, Lines } from './lines';
-import type { NotesFile } from './notes_file';
 import { notify } from './pages';
-import type { Picker } from './picker';
-import type { Stage } from './stage';
+import { type Line, Lines, type NotesFile, type Picker, type Stage, isFull, place } from './stage';
 
 const UNKNOWN: Unit = { name: 'units', perWorld: 1 };
 const DIGITS = 4;
@@ -55,20 +52,10 @@ export class MeasurePanel {
     if (this.first && waits) dots.push(this.first);
     const click = waits ? [`Click the ${this.first ? 'other' : 'first'} surface.`] : [];
     element('measure-hint').textContent = [...click, ...(this.stage.coarse ? [COARSE] : [])].join(' ');
-    this.lines.draw(
-      view,
-      measures.map(({ points }): Line => points),
-    );
-    this.ends.draw(
-      view,
-      dots.map((at): Line => [at, at]),
-    );
-    for (const [{ points }, label] of this.labels) {
-      const at = view.project(times(0.5, add(...points)));
-      label.hidden = !at;
-      if (at)
-        Object.assign(label.style, { left: `${(100 * at[0]) / view.width}%`, top: `${(100 * at[1]) / view.height}%` });
-    }
+    const [between, ends] = [measures.map(({ points }): Line => points), dots.map((at): Line => [at, at])];
+    this.lines.draw(view, between);
+    this.ends.draw(view, ends);
+    for (const [{ points }, label] of this.labels) place(label, view, times(0.5, add(...points)));
   }
 
   private get unit(): Unit {
@@ -77,10 +64,7 @@ export class MeasurePanel {
 
   private toggle(): void {
     this.first = null;
-    if (this.file.all.measures.length >= MOST_MEASURES) {
-      notify(`There are ${MOST_MEASURES} measures, as many as there can be.`);
-      return;
-    }
+    if (isFull(this.file.all.measures, MOST_MEASURES, 'measures')) return;
     this.picker.toggle('add-measure', (from) => {
       this.first = from;
       this.picker.start('add-measure', (to) => {

@@ -3,11 +3,9 @@ import { LONGEST_NAME, LONGEST_TEXT, MOST_NOTES, MOST_VIEWS, type Note, type Not
 import { cleared } from '../view/notes';
 import { type View, moved } from '../view/pose';
 import { length, subtract } from '../view/vector';
-import { button, element, make, onClick, press, pressed } from './dom';
-import type { NotesFile } from './notes_file';
+import { button, element, make, onClick, toggle } from './dom';
 import { notify } from './pages';
-import type { Picker } from './picker';
-import type { Stage } from './stage';
+import { type NotesFile, type Picker, type Stage, isFull, place } from './stage';
 
 const BEHIND = 0.97; // share of a note's depth; nearer surfels hide it
 
@@ -28,8 +26,7 @@ export class NotesPanel {
     });
     onClick('add-note', () => this.add());
     onClick('show-notes', () => {
-      press(element('show-notes'), !pressed(element('show-notes')));
-      element('markers').hidden = !pressed(element('show-notes'));
+      element('markers').hidden = !toggle('show-notes');
     });
     this.show();
   }
@@ -53,11 +50,9 @@ export class NotesPanel {
   async drawn(view: View, still: boolean): Promise<void> {
     const seen: { marker: HTMLElement; x: number; y: number; z: number }[] = [];
     for (const [{ position }, marker] of this.markers) {
-      const at = view.project(position);
-      marker.hidden = !at;
+      const at = place(marker, view, position);
       if (!at) continue;
       const [x, y, z] = [at[0] / view.width, at[1] / view.height, at[2]];
-      Object.assign(marker.style, { left: `${100 * x}%`, top: `${100 * y}%` });
       marker.classList.toggle('left', x > 0.55);
       if (!still) marker.classList.remove('behind');
       seen.push({ marker, x, y, z });
@@ -84,17 +79,13 @@ export class NotesPanel {
     const { pose, lens, target } = this.stage.shared();
     const there = views.find((view) => view.name === name);
     if (there) there.viewpoint = { pose, lens, target };
-    else if (views.length < MOST_VIEWS) views.push({ name, viewpoint: { pose, lens, target } });
-    else notify(`There are ${MOST_VIEWS} views, as many as there can be.`);
+    else if (!isFull(views, MOST_VIEWS, 'views')) views.push({ name, viewpoint: { pose, lens, target } });
     field.value = '';
     this.changed();
   }
 
   private add(): void {
-    if (this.all.notes.length >= MOST_NOTES) {
-      notify(`There are ${MOST_NOTES} notes, as many as there can be.`);
-      return;
-    }
+    if (isFull(this.all.notes, MOST_NOTES, 'notes')) return;
     this.picker.toggle('add-note', (position) => {
       this.editing = { text: '', position };
       this.all.notes.push(this.editing);

@@ -1,12 +1,42 @@
 // Panel of the camera path: list of keyframes, playback, saving.
 import { CameraPath, LONGEST, SECONDS, SHORTEST } from '../view/path';
 import type { Pose, View } from '../view/pose';
-import { button, download, element, make, onClick, press, pressed } from './dom';
-import { Film, filmable } from './film';
+import { button, download, element, make, onClick, press, toggle } from './dom';
 import { notify } from './pages';
 import type { Stage } from './stage';
 
 const MOST_BYTES = 1 << 26; // of a path file
+const TYPE = 'video/webm';
+const BITS = 16e6; // per second
+const SETTLING = 100; // milliseconds
+
+const filmable = (): boolean =>
+  typeof MediaRecorder !== 'undefined' &&
+  'captureStream' in HTMLCanvasElement.prototype &&
+  MediaRecorder.isTypeSupported(TYPE);
+
+// Real-time recording of a canvas.
+class Film {
+  private readonly parts: Blob[] = [];
+  private readonly recorder: MediaRecorder;
+
+  constructor(canvas: HTMLCanvasElement) {
+    this.recorder = new MediaRecorder(canvas.captureStream(), { mimeType: TYPE, videoBitsPerSecond: BITS });
+    this.recorder.ondataavailable = ({ data }) => this.parts.push(data);
+    this.recorder.start();
+  }
+
+  end(): Promise<Blob> {
+    return new Promise((give) => {
+      this.recorder.onstop = () => give(new Blob(this.parts, { type: TYPE }));
+      // the last frame is still being encoded
+      setTimeout(() => {
+        this.recorder.stop();
+        for (const track of this.recorder.stream.getTracks()) track.stop();
+      }, SETTLING);
+    });
+  }
+}
 
 interface Playing {
   record: boolean;
@@ -103,8 +133,7 @@ export class PathPanel {
   }
 
   private toggle(what: 'smooth' | 'loop'): void {
-    this.path[what] = !pressed(element(what));
-    press(element(what), this.path[what]);
+    this.path[what] = toggle(what);
     this.show();
   }
 

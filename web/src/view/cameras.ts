@@ -1,16 +1,9 @@
-// Cameras of the capture, from the optional cameras.json.
+// Cameras of the capture, from the optional cameras.json; the first view without any, and the size of the scene.
 import type { Vec3 } from '../bundle/manifest';
-import type { Lens, Pose } from './pose';
-import { add, dot, length, subtract, times } from './vector';
-
-export interface CaptureCamera {
-  name: string;
-  heldOut: boolean;
-  pose: Pose;
-  lens: Lens;
-  photograph: string | null; // file in the bundle
-  correction: number[] | null; // of the scene's colours to the photograph's: matrix and offset [3, 4] by rows
-}
+import type { Surfels } from '../bundle/surfels';
+import { SURFEL_WORDS } from '../bundle/tables';
+import { type Lens, type Pose, lookAt } from './pose';
+import { add, cross, dot, length, subtract, times, unit } from './vector';
 
 const FILE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
 const MOST = 100_000;
@@ -24,7 +17,7 @@ function correctionOf(found: unknown): number[] | null {
   return found.length === 12 ? found : null;
 }
 
-function camera(row: unknown): CaptureCamera | null {
+function camera(row: unknown) {
   if (typeof row !== 'object' || row === null) return null;
   const r = row as Record<string, unknown>;
   const [m, fx, fy, cx, cy, width, height] = [r.viewmat, r.fx, r.fy, r.cx, r.cy, r.width, r.height];
@@ -40,10 +33,11 @@ function camera(row: unknown): CaptureCamera | null {
     heldOut: r.held_out === true,
     pose: { position: times(-1, back), right, down, forward },
     lens,
-    photograph,
-    correction: correctionOf(r.correction),
+    photograph, // file in the bundle, or null
+    correction: correctionOf(r.correction), // of the scene's colours to the photograph's: matrix and offset [3, 4] by rows
   };
 }
+export type CaptureCamera = NonNullable<ReturnType<typeof camera>>;
 
 export function parseCameras(text: string): CaptureCamera[] {
   let json: unknown;
@@ -89,4 +83,31 @@ export function commonTarget(cameras: CaptureCamera[]): Vec3 | null {
     det3(column(0), b, column(2)) / det,
     det3(column(0), column(1), b) / det,
   ];
+}
+
+const SAMPLES = 4000; // surfels whose positions tell the size
+
+// Computes the surfels' median position and twice the median distance to it, robust to far surfels.
+export function extentOf(surfels: Surfels): { middle: Vec3; size: number } {
+  const step = Math.max(1, Math.floor(surfels.count / SAMPLES));
+  const rows: Vec3[] = [];
+  for (let i = 0; i < surfels.count; i += step) {
+    const at = i * SURFEL_WORDS;
+    rows.push([surfels.words[at], surfels.words[at + 1], surfels.words[at + 2]]);
+  }
+  if (!rows.length) return { middle: [0, 0, 0], size: 1 };
+  const median = (values: number[]): number => values.sort((a, b) => a - b)[values.length >> 1];
+  const middle = [0, 1, 2].map((c) => median(rows.map((row) => row[c]))) as Vec3;
+  const size = median(rows.map((row) => length([row[0] - middle[0], row[1] - middle[1], row[2] - middle[2]])));
+  return { middle: add(middle, surfels.origin), size: Math.max(2 * size, 1e-6) };
+}
+
+// Chooses the first pose. The scene frame's origin is the mean of the cameras, the farthest of which is about 1
+// away. So a scene on one side is viewed from the origin's side, and a scene around the origin from the side.
+export function firstPose(middle: Vec3, size: number, up: Vec3): Pose {
+  const distance = Math.min(Math.max(1, 0.5 * size), 1.6 * size);
+  const across = unit(cross(up, Math.abs(up[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  const aside = unit(add(across, times(0.3, up)));
+  const away = length(middle) > 0.5 * distance ? unit(times(-1, middle)) : aside;
+  return lookAt(add(middle, times(distance, away)), middle, up);
 }

@@ -21,6 +21,12 @@ export interface Lens {
 
 const NEAR = 1e-3; // depth at which lines end, as a share of that of their farther end
 
+// Coordinates of a point in a camera's frame.
+function inCamera({ position, right, down, forward }: Pose, point: Vec3): Vec3 {
+  const from = subtract(point, position);
+  return [dot(from, right), dot(from, down), dot(from, forward)];
+}
+
 export class View implements Lens {
   constructor(
     readonly pose: Pose,
@@ -48,19 +54,14 @@ export class View implements Lens {
   }
   // Projects a point to pixel coordinates and depth along the camera's axis; null outside the picture.
   project(point: Vec3): Vec3 | null {
-    const from = subtract(point, this.pose.position);
-    const z = dot(from, this.pose.forward);
-    const x = (this.fx * dot(from, this.pose.right)) / z + this.cx;
-    const y = (this.fy * dot(from, this.pose.down)) / z + this.cy;
+    const [across, down, z] = inCamera(this.pose, point);
+    const x = (this.fx * across) / z + this.cx;
+    const y = (this.fy * down) / z + this.cy;
     return z > 0 && x >= 0 && x < this.width && y >= 0 && y < this.height ? [x, y, z] : null;
   }
   // Projects the part of a line in front of the camera: pixel coordinates of its ends; null if there is none.
   segment(a: Vec3, b: Vec3): [number, number, number, number] | null {
-    const { position, right, down, forward } = this.pose;
-    const [p, q] = [a, b].map((at): Vec3 => {
-      const from = subtract(at, position);
-      return [dot(from, right), dot(from, down), dot(from, forward)];
-    });
+    const [p, q] = [a, b].map((at) => inCamera(this.pose, at));
     const near = NEAR * Math.max(Math.abs(p[2]), Math.abs(q[2]));
     if (Math.max(p[2], q[2]) < near || !near) return null;
     const pixel = (end: Vec3, other: Vec3): [number, number] => {
@@ -114,14 +115,8 @@ export function look(pose: Pose, up: Vec3, across: number, upwards: number): Pos
 
 // Orbits a point, which keeps its position on the screen.
 export function orbit(pose: Pose, target: Vec3, up: Vec3, across: number, upwards: number): Pose {
-  const from = subtract(pose.position, target);
-  const coordinates: Vec3 = [dot(from, pose.right), dot(from, pose.down), dot(from, pose.forward)];
-  const next = look(pose, up, across, upwards);
-  const offset = add(
-    add(times(coordinates[0], next.right), times(coordinates[1], next.down)),
-    times(coordinates[2], next.forward),
-  );
-  return { ...next, position: add(target, offset) };
+  const from = inCamera({ ...pose, position: target }, pose.position);
+  return moved({ ...look(pose, up, across, upwards), position: target }, ...from);
 }
 
 export function moved(pose: Pose, right: number, down: number, forward: number): Pose {

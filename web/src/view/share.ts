@@ -36,22 +36,11 @@ export function toHash({ pose, lens, target, show, residuals }: Shared): string 
   return `#${parts.join('&')}`;
 }
 
-// A camera in messages; lens: fx, fy, cx, cy, width, height.
-export interface Camera {
-  position: number[];
-  right: number[];
-  forward: number[];
-  target: number[];
-  lens: number[];
-}
-
-export const cameraOf = ({ pose, lens, target }: Viewpoint): Camera => ({
-  position: pose.position,
-  right: pose.right,
-  forward: pose.forward,
-  target,
-  lens: lensOf(lens),
-});
+// A camera in messages.
+export const cameraOf = ({ pose: { position, right, forward }, lens, target }: Viewpoint) => {
+  return { position, right, forward, target, lens: lensOf(lens) };
+};
+export type Camera = ReturnType<typeof cameraOf>;
 
 const FARTHEST = 1e9;
 

@@ -14,11 +14,6 @@ const RIM = 3; // pixels around discs that the low pass and wider kernels may re
 
 export type Part = [left: number, top: number, right: number, bottom: number]; // of a picture, in pixels
 
-export interface Sampling {
-  samples: number; // per pixel, along each axis
-  photoPixel: number; // side of a photograph's pixel in samples
-}
-
 // Computes the size of a view relative to the photographs. `photographed` has rows x, y, z, rate.
 export function sizeOf(photographed: Float32Array, view: View): number {
   const sizes: number[] = [];
@@ -62,8 +57,9 @@ export function partOf(words: Float32Array, view: View, near: number): Part {
   return [left, top, end, bottom];
 }
 
-// Chooses the sampling of a view with `pixels`; at most `mostSamples` per pixel and axis, and `mostPixels` in all.
-export function samplingOf(size: number, pixels: number, mostSamples: number, mostPixels: number): Sampling {
+// Chooses the samples per pixel, along each axis, of a view with `pixels`, and with them the side of a photograph's pixel
+// in samples; at most `mostSamples` per pixel and axis, and `mostPixels` in all.
+export function samplingOf(size: number, pixels: number, mostSamples: number, mostPixels: number) {
   const [low, high] = AS_TRAINED;
   if (low <= size && size <= high) return { samples: 1, photoPixel: 1 };
   const room = Math.floor(Math.sqrt(mostPixels / Math.max(pixels, 1)));

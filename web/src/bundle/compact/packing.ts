@@ -4,15 +4,6 @@ import { GRID, ROWS } from '../tables';
 
 const MOST_LAYERS = 2048;
 
-export interface Packing {
-  width: number;
-  height: number;
-  layers: number;
-  x: Uint32Array;
-  y: Uint32Array;
-  layer: Uint32Array;
-}
-
 interface Shelf {
   y: number;
   used: number;
@@ -20,8 +11,9 @@ interface Shelf {
 
 const roundUp = (value: number, step: number): number => Math.ceil(value / step) * step;
 
-// Packs tiles of sides (u, v), powers of two; 0: no tile.
-export function pack(u: Uint16Array, v: Uint16Array, pageWidth: number, mostRows: number): Packing {
+// Packs tiles of sides (u, v), powers of two; 0: no tile. Returns sides and number of the pages, and place and page of
+// every tile.
+export function pack(u: Uint16Array, v: Uint16Array, pageWidth: number, mostRows: number) {
   const refuse = (): never => {
     throw new DamagedBundle('bundle.json: the tiles do not fit into pages of this size.');
   };

@@ -10,33 +10,17 @@ const MOST_TEXELS = 2 ** 30; // in all pages: four gigabytes
 const BLOCK = 8;
 const FILE = 'texels.bin';
 
-// Tiles in surfel order.
-interface Tile {
-  surfel: number;
-  u: number;
-  v: number;
-}
-
-function tilesOf(surfels: Surfels): Tile[] {
+// Lists the tiles in surfel order.
+function tilesOf(surfels: Surfels) {
   const numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
-  const tiles: Tile[] = [];
+  const tiles = [];
   for (let surfel = 0; surfel < surfels.count; surfel++) {
     const sides = numbers[surfel * SURFEL_WORDS + WORD.sides];
     if (sides) tiles.push({ surfel, u: sides & 0xffff, v: sides >>> 16 });
   }
   return tiles;
 }
-
-// The inverse cosine transform of blocks of u x v texels.
-interface Transform {
-  u: number;
-  v: number;
-  across: Float64Array; // [u, u], frequency by position
-  down: Float64Array; // [v, v]
-  // by coefficient in stored order: offset of the row of its frequency along v in `half`, and along u in `across`
-  row: Int32Array;
-  wave: Int32Array;
-}
+type Tile = ReturnType<typeof tilesOf>[number];
 
 // Returns C(k, i, count) for all frequencies k and positions i.
 const cosines = (count: number): Float64Array =>
@@ -45,13 +29,17 @@ const cosines = (count: number): Float64Array =>
     return Math.sqrt((k ? 2 : 1) / count) * Math.cos((Math.PI * (i + 0.5) * k) / count);
   });
 
-function transformOf(u: number, v: number): Transform {
+// Returns the inverse cosine transform of blocks of u x v texels: `across` [u, u] and `down` [v, v], frequency by
+// position; by coefficient in stored order the offset of the row of its frequency along v in `half`, and along u in
+// `across`.
+function transformOf(u: number, v: number) {
   const order: [number, number][] = [];
   for (let k_v = 0; k_v < v; k_v++) for (let k_u = 0; k_u < u; k_u++) order.push([k_v, k_u]);
   order.sort((a, b) => a[0] * u + a[1] * v - (b[0] * u + b[1] * v) || a[0] - b[0] || a[1] - b[1]);
   const [row, wave] = [0, 1].map((axis) => Int32Array.from(order, (k) => k[axis] * u));
   return { u, v, across: cosines(u), down: cosines(v), row, wave };
 }
+type Transform = ReturnType<typeof transformOf>;
 
 const half = new Float64Array(BLOCK * BLOCK); // scratch of `inverse`: a block transformed along u
 

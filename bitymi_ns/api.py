@@ -25,10 +25,9 @@ from bitymi_ns.capture.types import OPENCV_AXES, Photograph
 from bitymi_ns.ops import (
     Fragments,
     Projection,
-    TooManyFragments,
     blended_image,
     can_rasterize,
-    draw_in_bands,
+    draw_by_lists,
     project,
     rasterize_image,
     trace,
@@ -158,10 +157,7 @@ def rasterize(
         fragments = trace(part, most=most)
         return blended_image(fragments, part, base, maps=maps), fragments
 
-    try:
-        image, fragments = draw(projection, 0)
-    except TooManyFragments as error:
-        image, fragments = draw_in_bands(projection, draw, error)
+    image, fragments = draw_by_lists(projection, draw)
     return RenderOutput.of_image(image, projection, fragments, background, maps)
 
 

@@ -1,5 +1,6 @@
-"""Views whose fragments exceed memory, drawn in bands of rows of tiles. A band is the same projection with the rows
-above it cut off; its fragments are computed when it is drawn and again in its backward pass."""
+"""Views whose fragments are in no list. Those whose fragments exceed memory are drawn in bands of rows of tiles: a band
+is the same projection with the rows above it cut off; its fragments are found when it is drawn and again in its
+backward pass."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ from .backend import cuda_backend
 from .capacity import TooManyFragments
 from .constants import TILE
 from .project import Projection
-from .trace import Fragments, masked_counts, trace
+from .trace import Fragments, trace
 
 T = TypeVar("T")
 
@@ -23,38 +24,33 @@ and be cleared for the next, which takes longer than finding the fragments."""
 
 
 @dataclass(frozen=True)
-class Bands:
-    """Fragments of a view drawn in bands; recomputed per query."""
+class Unlisted:
+    """Fragments of a view that are in no list: too many for one, or drawn without; found again per query, without
+    gradient."""
 
-    projection: Projection  # of the whole view
-    rows: tuple[tuple[int, int], ...]  # first and last pixel row (exclusive) of each band, top to bottom
+    projection: Projection
     rim: float  # as in `trace`
-    count: int  # number of fragments F
+    most: int = 0  # largest number of fragments of a list, likewise
 
     def __len__(self) -> int:
-        return self.count
+        return sum(len(fragments) for fragments in self.lists())
 
     def lists(self) -> Iterator[Fragments]:
-        """Yield the fragments band by band, without gradient."""
-        for top, bottom in self.rows:
-            with torch.no_grad():
-                fragments = trace(band(self.projection, top, bottom), self.rim)
-            yield fragments
-            del fragments  # before the next list is made
+        """Yield lists of the fragments from top to bottom."""
+        return fitting_lists(self.projection, self.most, self.rim)
 
     def overdraw(self) -> Tensor:
         """Count the blended surfels per pixel: [H, W, 1] int32."""
         return torch.cat([fragments.overdraw() for fragments in self.lists()])
 
-    def masked_counts(self, mask: Tensor, n: int) -> Tensor:
-        """Count fragments on masked pixels; see `trace.masked_counts`."""
-        camera = self.projection.camera
-        if mask.numel() != camera.width * camera.height:
-            raise ValueError(f"the mask has {mask.numel()} pixels, the view {camera.width * camera.height}")
-        rows = mask.reshape(camera.height, camera.width)
-        counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
-        for (top, bottom), fragments in zip(self.rows, self.lists(), strict=True):
-            counts += masked_counts(fragments, rows[top:bottom].reshape(-1), n)
+    def masked_counts(self, mask: Tensor) -> Tensor:
+        """Count the fragments of each surfel on masked pixels; see `Fragments.masked_counts`."""
+        counts = torch.zeros(len(self.projection.geom), dtype=torch.int32, device=mask.device)
+        rows, top = mask.view(self.projection.camera.height, -1), 0
+        for fragments in self.lists():
+            counts += fragments.masked_counts(rows[top : top + fragments.height].reshape(-1))
+            top += fragments.height
+            del fragments  # before the next list is made
         return counts
 
 
@@ -102,19 +98,17 @@ def by_bands(waiting: list[tuple[int, int]], draw: Callable[[int, int], T]) -> I
         waiting = rest
 
 
-def draw_in_bands(
+def draw_by_lists(
     projection: Projection,
     draw: Callable[[Projection, int | None], tuple[Tensor, Fragments]],
-    error: TooManyFragments,
     most: int = 0,
     rim: float = 1e-3,
-) -> tuple[Tensor, Bands]:
-    """Draw a view that has too many fragments for one list.
+) -> tuple[Tensor, Fragments | Unlisted]:
+    """Draw a view by a list of its fragments, or in bands if they are too many for one.
 
     Args:
-        draw: draws a band, given its projection and the largest number of fragments, as in `trace`: image [pixels, C]
-            and fragments. Called again in the backward pass.
-        error: of the whole view.
+        draw: draws the view or a band, given its projection and the largest number of fragments, as in `trace`: image
+            [pixels, C] and fragments. Called again in the backward pass of a band.
         most, rim: as in `trace`.
 
     Returns:
@@ -123,24 +117,22 @@ def draw_in_bands(
     Raises:
         TooManyFragments: a single row of tiles has too many.
     """
+    try:
+        return draw(projection, most)
+    except TooManyFragments as error:
+        bands = split_refused(0, projection.camera.height, error)
 
-    def draw_band(top: int, bottom: int) -> tuple[Tensor, int]:
-        part, found = band(projection, top, bottom), []
+    def draw_band(top: int, bottom: int) -> Tensor:
+        part, limits = band(projection, top, bottom), [most]
 
         def draw_once(geom: Tensor) -> Tensor:
             # no limit in the backward pass: the band fitted in the forward pass
-            image, fragments = draw(replace(part, geom=geom), None if found else most)
-            found.append(len(fragments))
-            return image
+            return draw(replace(part, geom=geom), limits.pop() if limits else None)[0]
 
-        image = checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False)
-        return image, found[0]
+        return checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False)
 
-    drawn = list(by_bands(split_refused(0, projection.camera.height, error), draw_band))
-    seen = replace(projection, geom=projection.geom.detach(), frames=projection.frames.detach())
-    rows = tuple((top, bottom) for top, bottom, _ in drawn)
-    count = sum(length for _, _, (_, length) in drawn)
-    return torch.cat([image for _, _, (image, _) in drawn]), Bands(seen, rows, rim, count)
+    image = torch.cat([drawn for _, _, drawn in by_bands(bands, draw_band)])
+    return image, Unlisted(projection.detached(), rim, most)
 
 
 def split_refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, int]]:

@@ -182,12 +182,3 @@ def soft_overdraw(fragments: Fragments, half: float) -> Tensor:
         raise ValueError(f"the weight that counts one half must be above 0, not {half}")
     count = fragments.weight / (fragments.weight + half)
     return count.new_zeros(fragments.width * fragments.height).index_add(0, fragments.pixel, count)
-
-
-def composite(fragments: Fragments, values: Tensor) -> Tensor:
-    """Composite values [F, C]: sums of w times value per pixel, [H * W, C]."""
-    if values.dim() != 2 or len(values) != len(fragments):
-        raise ValueError(f"values must have a row for each of the {len(fragments)} fragments, not {list(values.shape)}")
-    on_same_device(fragments.weight, values=values)
-    out = values.new_zeros(fragments.width * fragments.height, values.shape[1])
-    return out.index_add(0, fragments.pixel, fragments.weight[:, None] * values)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -83,6 +83,10 @@ class Projection:
     mean2d_absgrad: Tensor | None = None
     whole: Projection | None = None
     alpha: TexelAlpha | None = None
+
+    def detached(self) -> Projection:
+        """Return the projection without its graph."""
+        return replace(self, geom=self.geom.detach(), frames=self.frames.detach())
 
     def take_mean2d(self, grad: Tensor, absgrad: Tensor) -> None:
         """Store the gradients of the projected centres; those of bands are added up in the whole view."""

@@ -4,21 +4,16 @@ Two bits per fragment are kept, in masks of the pairs of surfel and tile; the ba
 tile. So a view with any number of fragments is drawn at once, and the host waits once, for the number of pairs.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-
 import torch
 from torch import Tensor
 
 from .backend import cuda_backend, dense, kernel, module
-from .bands import fitting_lists
+from .bands import Unlisted
 from .bin_cuda import tile_lists
 from .blend import checked_texels
 from .constants import IMAGE_CHANNELS
-from .fragment_list import Layout
 from .project import Projection
 from .texel import TexelDescent, TexelTiles, gradient_or_step
-from .trace import Fragments, counted
 from .trace_cuda import layout_of
 
 
@@ -26,33 +21,6 @@ def can_rasterize(device: torch.device) -> bool:
     """Return True if `rasterize_image` can run: on CUDA devices without deterministic algorithms. These need a list,
     because integer sums need a bound of the gradients of alpha texels."""
     return cuda_backend(device) and not torch.are_deterministic_algorithms_enabled()
-
-
-@dataclass(frozen=True)
-class Marks:
-    """Fragments of a view, kept as masks; recomputed per query."""
-
-    projection: Projection
-    rim: float  # as in `trace`
-    layout: Layout  # pairs and masks
-
-    def __len__(self) -> int:
-        camera = self.projection.camera
-        every = torch.ones(camera.width * camera.height, dtype=torch.bool, device=self.projection.geom.device)
-        return int(self.masked_counts(every, len(self.projection.geom)).sum())
-
-    def lists(self) -> Iterator[Fragments]:
-        """Yield the fragments without gradient, top to bottom: one list, or bands if memory requires it."""
-        return fitting_lists(self.projection, rim=self.rim)
-
-    def overdraw(self) -> Tensor:
-        """Count the blended surfels per pixel: [H, W, 1] int32."""
-        return torch.cat([fragments.overdraw() for fragments in self.lists()])
-
-    def masked_counts(self, mask: Tensor, n: int) -> Tensor:
-        """Count fragments on the pixels of a mask [H * W] bool: [n] int32; see `trace.masked_counts`."""
-        camera = self.projection.camera
-        return counted({"layout": self.layout.handle, "width": camera.width, "height": camera.height}, mask, n)
 
 
 class _Rasterized(torch.autograd.Function):
@@ -76,13 +44,13 @@ class _Rasterized(torch.autograd.Function):
             image=image,
             transmittance=transmittance,
         )
-        layout = layout_of({"masks": masks, **vars(bins)}, camera.width, camera.height)
+        ctx.layout = layout_of({"masks": masks, **vars(bins)}, camera.width, camera.height)
         ctx.save_for_backward(g, b, t, texel_alpha, cuts, transmittance)
-        ctx.layout, ctx.projection, ctx.rim, ctx.moves, ctx.descent = layout, projection, rim, moves, descent
-        return image, layout
+        ctx.projection, ctx.rim, ctx.moves, ctx.descent = projection, rim, moves, descent
+        return image
 
     @staticmethod
-    def backward(ctx, dimage, _layout):
+    def backward(ctx, dimage):
         geom, base, texels, texel_alpha, cuts, transmittance = ctx.saved_tensors
         pairs, kernels = ctx.layout.handle.pairs, module(geom.device)
         out = {
@@ -123,7 +91,7 @@ def rasterize_image(
     move_surfels: bool = True,
     descent: TexelDescent | None = None,
     rim: float = 1e-3,
-) -> tuple[Tensor, Marks]:
+) -> tuple[Tensor, Unlisted]:
     """Draw a view: `trace` and `blended_image` without maps, in one kernel each forward and backward.
 
     Differentiable in `projection.geom`, its alpha texels, `base` and `texels`. The backward pass fills
@@ -149,6 +117,5 @@ def rasterize_image(
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, even if nothing else learns
     alpha = None if projection.alpha is None else projection.alpha.values
-    image, layout = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
-    seen = replace(projection, geom=geom.detach(), frames=projection.frames.detach())
-    return image, Marks(seen, rim, layout)
+    image = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
+    return image, Unlisted(projection.detached(), rim)

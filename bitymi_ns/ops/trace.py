@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +15,7 @@ from .constants import GEOM
 from .fragment_list import Layout
 from .project import Projection
 
-__all__ = ["Fragments", "TooManyFragments", "masked_counts", "select", "trace"]
+__all__ = ["Fragments", "TooManyFragments", "select", "trace"]
 
 
 @dataclass
@@ -76,18 +75,21 @@ class Fragments:
         w, uv, depth = self.weight.detach(), self.uv.detach(), self.depth.detach()
         return {"weight": w, "uv": uv, "depth": depth, "sigma": self.sigma}
 
-    def lists(self) -> Iterator[Fragments]:
-        """Yield the view's lists from top to bottom: this one."""
-        yield self
-
     def overdraw(self) -> Tensor:
         """Count the blended surfels per pixel: [H, W, 1] int32."""
         count = torch.bincount(self.pixel, minlength=self.width * self.height)
         return count.to(torch.int32).view(self.height, self.width, 1)
 
-    def masked_counts(self, mask: Tensor, n: int) -> Tensor:
-        """Count fragments on masked pixels; see `masked_counts`."""
-        return masked_counts(self, mask, n)
+    def masked_counts(self, mask: Tensor) -> Tensor:
+        """Count the fragments of each surfel on the pixels of a mask [H * W] bool (FastGS's per-view importance): [N]
+        int32. Raises ValueError: the mask has another number of pixels or lies on another device."""
+        on_same_device(self.weight, mask=mask)
+        if mask.numel() != self.width * self.height:
+            raise ValueError(f"the mask has {mask.numel()} pixels, the view {self.width * self.height}")
+        counts = torch.zeros(self.surfels, dtype=torch.int32, device=mask.device)
+        flat = mask.reshape(-1).to(torch.uint8).contiguous()
+        function("masked_counts", mask.device)(**self.view, mask=flat, counts=counts)
+        return counts
 
 
 def _for_layout(numbers: dict[str, Tensor], layout: Layout) -> dict[str, Tensor]:
@@ -180,33 +182,3 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
     width, height = fragments.width, fragments.height
     layout, found = by.select(fragments.layout, fragments._numbers, keep, width, height)
     return Fragments(**found, width=width, height=height, layout=layout, surfels=fragments.surfels)
-
-
-def masked_counts(fragments: Fragments, mask: Tensor, n: int) -> Tensor:
-    """Count the blended fragments of each surfel on masked pixels (FastGS's per-view importance).
-
-    Args:
-        fragments: of an H x W view.
-        mask: [H * W] bool.
-
-    Returns:
-        [n] int32.
-
-    Raises:
-        ValueError: the mask has another number of pixels or lies on another device.
-    """
-    on_same_device(fragments.weight, mask=mask)
-    if n != fragments.surfels:
-        raise ValueError(f"the fragments are those of {fragments.surfels} surfels, not of {n}")
-    if mask.numel() != fragments.width * fragments.height:
-        raise ValueError(f"the mask has {mask.numel()} pixels, the view {fragments.width * fragments.height}")
-    return counted(fragments.view, mask, n)
-
-
-def counted(view: dict[str, Any], mask: Tensor, n: int) -> Tensor:
-    """Count as `masked_counts`, for a mask [H * W] bool and the list with the arguments `view` (`Fragments.view`):
-    [n] int32."""
-    counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
-    flat = mask.reshape(-1).to(torch.uint8).contiguous()
-    function("masked_counts", counts.device)(**view, mask=flat, counts=counts)
-    return counts

@@ -11,15 +11,13 @@ from torch import Tensor, nn
 
 from bitymi_ns.ops import (
     VIEW_COLORS,
-    Bands,
     Fragments,
-    Marks,
     Projection,
     TexelDescent,
-    TooManyFragments,
+    Unlisted,
     blended_image,
     can_rasterize,
-    draw_in_bands,
+    draw_by_lists,
     project,
     rasterize_image,
     soft_overdraw,
@@ -49,7 +47,7 @@ class RenderOutput:
         depth: [H, W, 1] sum of w z, camera z, not divided by alpha; None without maps.
         normal: [H, W, 3] sum of w n, camera frame (OpenCV), facing the camera; None without maps.
         soft_overdraw: [H, W, 1] differentiable count of fragments per pixel; None without `overdraw_half`.
-        fragments: blended fragments; `Bands` if they were too many for one list, `Marks` if rendered without a list.
+        fragments: blended fragments; `Unlisted` if rendered without a list of all.
         projection: projected surfels.
     """
 
@@ -59,7 +57,7 @@ class RenderOutput:
     depth: Tensor | None
     normal: Tensor | None
     soft_overdraw: Tensor | None
-    fragments: Fragments | Bands | Marks
+    fragments: Fragments | Unlisted
     projection: Projection
 
     @classmethod
@@ -67,7 +65,7 @@ class RenderOutput:
         cls,
         image: Tensor,
         projection: Projection,
-        fragments: Fragments | Bands | Marks,
+        fragments: Fragments | Unlisted,
         background: Tensor | None,
         maps: bool,
         soft_overdraw: bool = False,
@@ -192,6 +190,9 @@ class Scene(nn.Module):
         read: Tensor | None = None
 
         def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:
+            nonlocal read
+            if part.whole is not None and read is None and descent is not None and isinstance(field, TexelField):
+                read = field.texels.detach().clone()  # a band's backward pass moves texels that others read again
             fragments = trace(part, self.config.rim, most)
             residual = {} if field is None else field.residual(fragments, part.frames, bound, learns, descent, read)
             image = blended_image(fragments, part, base, maps=maps, **residual)
@@ -199,14 +200,7 @@ class Scene(nn.Module):
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
             return image, fragments
 
-        try:
-            image, fragments = draw(projection, self.config.max_fragments)
-        except TooManyFragments as error:
-            if descent is not None and isinstance(
-                self.field, TexelField
-            ):  # the backward pass of a band moves texels before another is rendered again
-                read = self.field.texels.detach().clone()
-            image, fragments = draw_in_bands(projection, draw, error, self.config.max_fragments, self.config.rim)
+        image, fragments = draw_by_lists(projection, draw, self.config.max_fragments, self.config.rim)
         return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)
 
     def _unlisted_texture(

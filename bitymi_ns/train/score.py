@@ -82,7 +82,7 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
         view = views[number].to(device)
         output, rgb, target = view.drawn(scene, background)
         bad = bad_pixels(rgb, target, config.densify.error_threshold, view.mask)
-        counts = output.fragments.masked_counts(bad.flatten(), n)  # [N]
+        counts = output.fragments.masked_counts(bad.flatten())  # [N]
         loss = photometric(rgb, target, config.loss.ssim_weight, view.mask)
         total += counts
         weighted += loss.double() * counts

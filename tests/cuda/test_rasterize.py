@@ -10,7 +10,7 @@ from torch import Tensor
 
 import bitymi_ns
 from bitymi_ns import ops
-from bitymi_ns.ops import Marks, trace_cuda
+from bitymi_ns.ops import Unlisted, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.parameters import GEOMETRY
 from tests.ops.golden import SceneCase, camera_of, extreme_scenes, load_golden, random_scene
@@ -183,13 +183,13 @@ def test_its_fragments_are_those_of_the_list(device: torch.device, monkeypatch: 
     projection = ops.project(*(learned.leaves[name] for name in GEOMETRY), learned.camera)
     projection = replace(projection, alpha=learned.alpha)
     with torch.no_grad():
-        _, marks = ops.rasterize_image(projection, learned.base, **learned.texture)
+        _, unlisted = ops.rasterize_image(projection, learned.base, **learned.texture)
         fragments = ops.trace(projection)
     mask = torch.arange(70 * 40, device=device) % 3 > 0
-    assert isinstance(marks, Marks) and len(marks) == len(fragments) > 1000
-    assert torch.equal(marks.masked_counts(mask, 60), fragments.masked_counts(mask, 60))
-    assert torch.equal(marks.overdraw(), fragments.overdraw())
-    assert [torch.equal(part.weight, fragments.weight) for part in marks.lists()] == [True]
+    assert isinstance(unlisted, Unlisted) and len(unlisted) == len(fragments) > 1000
+    assert torch.equal(unlisted.masked_counts(mask), fragments.masked_counts(mask))
+    assert torch.equal(unlisted.overdraw(), fragments.overdraw())
+    assert [torch.equal(part.weight, fragments.weight) for part in unlisted.lists()] == [True]
 
     overdraw, empty_list = fragments.overdraw(), trace_cuda.empty_list
     fit = max(int(rows.sum()) for rows in overdraw.split(16))  # fragments of a row of tiles
@@ -201,7 +201,7 @@ def test_its_fragments_are_those_of_the_list(device: torch.device, monkeypatch: 
 
     monkeypatch.setattr(trace_cuda, "empty_list", small_ones)
     monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: fit)
-    assert len(list(marks.lists())) == 3 and torch.equal(marks.overdraw(), overdraw)
+    assert len(list(unlisted.lists())) == 3 and torch.equal(unlisted.overdraw(), overdraw)
 
 
 def test_it_draws_on_cards_alone_and_not_where_sums_are_exact(device: torch.device, cpu: Context, exactly) -> None:
@@ -219,20 +219,20 @@ def test_which_pictures_of_a_scene_need_no_list(device: torch.device) -> None:
     scene, camera = scene.to(device), camera.to(device)
     unlisted = [scene.render(camera), scene.render(camera, field_mode="frozen")]
     lists = [scene.render(camera, maps=True), scene.render(camera, overdraw_half=0.005)]
-    assert all(isinstance(output.fragments, Marks) for output in unlisted)
+    assert all(isinstance(output.fragments, Unlisted) for output in unlisted)
     assert all(isinstance(output.fragments, ops.Fragments) for output in lists)
     for output in (*unlisted, *lists):
         assert len(output.fragments) == len(lists[0].fragments)
         torch.testing.assert_close(output.rgb, lists[0].rgb, rtol=1e-9, atol=1e-12)
     assert isinstance(scene.render(camera, field_mode="off").fragments, ops.Fragments)  # alphas without their colours
     scene.field.alpha = None
-    assert isinstance(scene.render(camera, field_mode="off").fragments, Marks)
+    assert isinstance(scene.render(camera, field_mode="off").fragments, Unlisted)
 
 
 def test_the_public_function_lists_for_maps_alone(device: torch.device) -> None:
     values, camera = {name: value.to(device) for name, value in surfels().items()}, api_camera().to(device)
     drawn, listed = (bitymi_ns.rasterize(**values, camera=camera, maps=maps) for maps in (False, True))
-    assert isinstance(drawn.fragments, Marks) and isinstance(listed.fragments, ops.Fragments)
+    assert isinstance(drawn.fragments, Unlisted) and isinstance(listed.fragments, ops.Fragments)
     torch.testing.assert_close(drawn.rgb, listed.rgb, rtol=1e-9, atol=1e-12)
     got, want = (torch.autograd.grad(one.rgb.square().sum(), list(values.values())) for one in (drawn, listed))
     for name, gradient, expected in zip(values, got, want, strict=True):

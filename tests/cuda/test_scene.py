@@ -44,7 +44,7 @@ def test_masked_counts_equal_those_of_the_cpu(device: torch.device, cpu) -> None
 
     def counts(device: torch.device) -> Tensor:
         scene, camera = scene_of(case, device, False)
-        return scene.render(camera).fragments.masked_counts(mask.to(device), 40).cpu()
+        return scene.render(camera).fragments.masked_counts(mask.to(device)).cpu()
 
     got = counts(device)
     with cpu():

@@ -11,7 +11,7 @@ from torch import Tensor
 from bitymi_ns.bake.pipeline import trained_texels
 from bitymi_ns.bake.prune import prune_and_resample
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.ops import Bands
+from bitymi_ns.ops import Unlisted
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.fit import Trainer
@@ -32,7 +32,7 @@ def drawn(device: torch.device, most: int = 0) -> tuple[dict[str, Tensor], int]:
     output = scene.to(device).render(camera.to(device))
     output.rgb.square().sum().backward()
     found = {name: p.grad for name, p in scene.named_parameters()} | {"rgb": output.rgb.detach()}
-    lists = len(output.fragments.rows) if isinstance(output.fragments, Bands) else 1
+    lists = len(list(output.fragments.lists())) if isinstance(output.fragments, Unlisted) else 1
     return {name: value.cpu() for name, value in found.items()}, lists
 
 

@@ -277,11 +277,10 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
     for match, call in {
         "residual must have shape": lambda: ops.blended_image(fragments, projection, frames[:, :3], residual=few),
         "residual is on device 'meta'": lambda: ops.blended_image(fragments, projection, frames[:, :3], residual=far),
-        "mask is on device 'meta'": lambda: ops.masked_counts(fragments, mask, 10),
+        "mask is on device 'meta'": lambda: fragments.masked_counts(mask),
         "log_scales is on device 'meta', it must be on": lambda: ops.project(*moved, camera),
         "frames is on device 'meta'": lambda: ops.fragment_residual(fragments, frames.to("meta"), grid, ()),
         "sv_rgb is on device 'meta'": lambda: ops.view_color("sv", sites, leaves[0], camera.exact_center),
-        "values is on device 'meta'": lambda: ops.composite(fragments, far),
         "16 bytes": lambda: ops.trace(replace(projection, geom=shifted)),
     }.items():
         with pytest.raises(ValueError, match=match):

@@ -172,6 +172,12 @@ def tiles_reached(weights: Tensor, width: int, height: int) -> Tensor:
     return (padded.view(down, 16, across, 16, -1).amax((1, 3)) > 0).sum((0, 1))
 
 
+def composite(fragments: ops.Fragments, values: Tensor) -> Tensor:
+    """Composite values [F, C]: sums of w times value per pixel, [H * W, C]."""
+    out = values.new_zeros(fragments.width * fragments.height, values.shape[1])
+    return out.index_add(0, fragments.pixel, fragments.weight[:, None] * values)
+
+
 def composite_colors(
     fragments: ops.Fragments, projection: ops.Projection, colors: Tensor, maps: bool = False
 ) -> Tensor:
@@ -179,7 +185,7 @@ def composite_colors(
     geom = projection.geom.index_select(0, fragments.surfel)
     values = [colors, torch.ones_like(colors[:, :1]), geom[:, 11:12]]
     values += [fragments.depth[:, None], geom[:, 12:15]] if maps else []
-    return ops.composite(fragments, torch.cat(values, 1))
+    return composite(fragments, torch.cat(values, 1))
 
 
 def dense(fragments: ops.Fragments, values: Tensor, n: int) -> Tensor:

@@ -71,7 +71,7 @@ def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPat
     projection = ops.project(*surfels, camera_of(case, torch.float64))
     fragments = ops.trace(projection)
     ops.blended_image(fragments, projection, torch.full((80, 3), 0.3).double(), maps=True).sum().backward()
-    counts = ops.masked_counts(fragments, torch.ones(64 * 48, dtype=torch.bool), 80)
+    counts = fragments.masked_counts(torch.ones(64 * 48, dtype=torch.bool))
     assert not made
     assert torch.equal(counts, torch.bincount(fragments.surfel, minlength=80))
     assert fragments.surfel is fragments.surfel and len(fragments.pixel) == len(fragments) and len(made) == 1

@@ -274,7 +274,7 @@ def test_masked_counts_count_blended_fragments_on_masked_pixels(threads: int) ->
     fragments = scene.render(camera).fragments
     mask = torch.rand(case.width * case.height, generator=torch.Generator().manual_seed(0)) > 0.5
     backend.module(torch.device("cpu")).set_num_threads(threads)
-    counts = ops.masked_counts(fragments, mask, 30)
+    counts = fragments.masked_counts(mask)
     backend.module(torch.device("cpu")).set_num_threads(0)
     on_mask = fragments.surfel[mask[fragments.pixel.long()]].long()
     assert torch.equal(counts.long(), torch.bincount(on_mask, minlength=30))
@@ -337,4 +337,4 @@ def test_wrong_inputs_are_refused() -> None:
     with pytest.raises(ValueError, match="one size"):
         ops.ssim(torch.rand(20, 20, 3), torch.rand(20, 21, 3))
     with pytest.raises(ValueError, match="pixels"):
-        ops.masked_counts(scene.render(camera).fragments, torch.ones(3, dtype=torch.bool), 4)
+        scene.render(camera).fragments.masked_counts(torch.ones(3, dtype=torch.bool))

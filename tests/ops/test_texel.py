@@ -15,7 +15,7 @@ from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
-from tests.ops.golden import SceneCase, random_scene, reference_colors
+from tests.ops.golden import SceneCase, composite, random_scene, reference_colors
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 
@@ -70,7 +70,7 @@ def test_image_and_gradients_against_the_reference(dtype: torch.dtype, bound: fl
     image = case.image(*got[:2], replace(f, uv=got[2], weight=got[3]), bound=bound)
     tiles = replace(case.tiles, extent=case.tiles.extent.double())
     exact = replace(f, uv=want[2], weight=want[3])
-    expected = ops.composite(exact, reference_colors(exact, *want[:2], tiles, bound))
+    expected = composite(exact, reference_colors(exact, *want[:2], tiles, bound))
     loss_weights = torch.linspace(-1, 1, image.numel(), dtype=torch.float64).view_as(image)
     (image * loss_weights.to(dtype)).sum().backward()
     (expected * loss_weights).sum().backward()

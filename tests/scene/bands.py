@@ -3,7 +3,7 @@
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Bands, TexelDescent
+from bitymi_ns.ops import Fragments, TexelDescent, Unlisted
 from bitymi_ns.scene import Camera, Scene
 from bitymi_ns.scene.field import TexelField
 from tests.ops.golden import random_scene
@@ -17,7 +17,7 @@ def make(device: torch.device, most: int, **options: object) -> tuple[Scene, Cam
     return scene_of(random_scene(60, 5, WIDTH, HEIGHT), device, max_fragments=most, **options)
 
 
-def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Tensor]]:
+def step(device: torch.device, most: int) -> tuple[Fragments | Unlisted, dict[str, Tensor]]:
     """Compute the fragments and all results of a training step."""
     scene, camera = make(device, most, texture_moves_surfels=True)
     background = torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64, device=device)
@@ -30,7 +30,7 @@ def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Ten
     result = {
         "image": image.detach(),
         "overdraw": output.overdraw,
-        "masked counts": output.fragments.masked_counts(mask, len(scene)),
+        "masked counts": output.fragments.masked_counts(mask),
         "mean2d_grad": output.projection.mean2d_grad,
         "mean2d_absgrad": output.projection.mean2d_absgrad,
         **{f"gradient of {name}": p.grad for name, p in scene.named_parameters()},
@@ -38,7 +38,7 @@ def step(device: torch.device, most: int) -> tuple[Bands | object, dict[str, Ten
     return output.fragments, result
 
 
-def texel_step(device: torch.device, most: int, alpha: bool = False) -> tuple[Bands | object, dict[str, Tensor]]:
+def texel_step(device: torch.device, most: int, alpha: bool = False) -> tuple[Fragments | Unlisted, dict[str, Tensor]]:
     """Compute the fragments and the results of a training step that moves texels, with or without alphas."""
     scene, camera = make(device, most, texture_moves_surfels=True)
     g = torch.Generator().manual_seed(2)

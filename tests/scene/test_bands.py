@@ -30,11 +30,11 @@ def test_values_and_gradients_do_not_change(share: float, monkeypatch: pytest.Mo
     monkeypatch.setattr(scene_module, "trace", counted)
     most = int(share * len(whole))
     parts, got = bands.step(CPU, most)
-    assert isinstance(parts, ops.Bands) and len(parts) == len(whole)
-    assert parts.rows[0][0] == 0 and parts.rows[-1][1] == bands.HEIGHT
-    assert all(a[1] == b[0] and a[1] % 16 == 0 for a, b in zip(parts.rows, parts.rows[1:], strict=False))
+    heights = [fragments.height for fragments in parts.lists()]
+    assert isinstance(parts, ops.Unlisted) and len(parts) == len(whole)
+    assert sum(heights) == bands.HEIGHT and not any(height % 16 for height in heights[:-1])
     # each band once forward and once backward
-    assert max(lengths) <= most and len(lengths) == 2 * len(parts.rows)
+    assert max(lengths) <= most and len(lengths) == 2 * len(heights)
     bands.assert_same(got, want)
 
 
@@ -42,7 +42,7 @@ def test_values_and_gradients_do_not_change(share: float, monkeypatch: pytest.Mo
 def test_bands_read_texels_that_no_other_band_has_moved(alpha: bool) -> None:
     whole, want = bands.texel_step(CPU, 0, alpha)
     parts, got = bands.texel_step(CPU, int(0.3 * len(whole)), alpha)
-    assert isinstance(parts, ops.Bands) and len(parts.rows) > 2 and want["texels"].abs().max() > 0.1
+    assert isinstance(parts, ops.Unlisted) and len(list(parts.lists())) > 2 and want["texels"].abs().max() > 0.1
     bands.assert_same(got, want)
 
 
@@ -65,7 +65,7 @@ def test_lists_that_fit_are_the_whole_view(most: int) -> None:
         list(ops.fitting_lists(whole.projection, 50))
     with torch.no_grad():
         without = bands.make(CPU, most)[0].render(camera)
-    assert isinstance(without.fragments, ops.Bands) == (most == 1500)
+    assert isinstance(without.fragments, ops.Unlisted) == (most == 1500)
     torch.testing.assert_close(without.rgb, whole.rgb.detach(), rtol=1e-12, atol=1e-12)
 
 
@@ -73,7 +73,7 @@ def test_memory_bounds_a_list_where_nothing_else_does(monkeypatch: pytest.Monkey
     whole, want = bands.step(CPU, 0)
     monkeypatch.setattr(trace_cpu, "MOST", 1500)
     parts, got = bands.step(CPU, 0)
-    assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Bands)
+    assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Unlisted)
     bands.assert_same(got, want)
     found = list(ops.fitting_lists(parts.projection))
     assert len(found) > 1 and all(len(f) <= 1500 for f in found)
@@ -93,7 +93,7 @@ def test_a_list_that_memory_does_not_hold_is_drawn_in_bands(monkeypatch: pytest.
 
     monkeypatch.setattr(trace_cpu, "empty_list", scarce)
     parts, got = bands.step(CPU, 0)
-    assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Bands)
+    assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Unlisted)
     bands.assert_same(got, want)
     scene, camera = bands.make(CPU, 0)
     monkeypatch.setattr(scene_module, "blended_image", Mock(side_effect=RuntimeError(REFUSED)))
@@ -113,5 +113,5 @@ def test_training_goes_on() -> None:
         terms, output, report = trainer.advance()
         losses.append(float(terms["photometric"]))
         densified += "pruned" in report
-        banded += isinstance(output.fragments, ops.Bands)
+        banded += isinstance(output.fragments, ops.Unlisted)
     assert densified and banded > 10 and losses[-1] < losses[0]

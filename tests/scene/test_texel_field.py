@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import Bands
+from bitymi_ns.ops import Unlisted
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.field import TexelField
@@ -81,6 +81,6 @@ def test_bands_change_nothing() -> None:
         most = int(0.8 * len(output.fragments))
         output.rgb.square().sum().backward()
         results.append([output.rgb.detach(), scene.field.texels.grad, scene.surfels["means"].grad])
-    assert isinstance(output.fragments, Bands)
+    assert isinstance(output.fragments, Unlisted)
     for whole, parts in zip(*results, strict=True):
         torch.testing.assert_close(parts, whole, rtol=1e-9, atol=1e-9)

@@ -142,13 +142,9 @@ def test_shapes_and_dtypes_that_do_not_fit_are_refused(data: st.DataObject) -> N
             [projection.frames, table, w1, w2, w3],
             lambda f, *w: ops.fragment_residual(fragments, f, geometry, w),
         ),
-        "composite": ([colors], lambda c: ops.composite(fragments, c)),
         "field": ([params["means"], table, w1, w2, w3], lambda x, *w: ops.field(x, geometry, *w)),
         "ssim": ([image, image * 0.5], ops.ssim),
-        "masked_counts": (
-            [torch.ones(16 * 12, dtype=torch.bool)],
-            lambda mask: ops.masked_counts(fragments, mask, 7),
-        ),
+        "masked_counts": ([torch.ones(16 * 12, dtype=torch.bool)], fragments.masked_counts),
     }
     values, function = calls[data.draw(st.sampled_from(sorted(calls)))]
     spoiled(tuple(values), function)
@@ -161,8 +157,6 @@ def test_fragments_of_one_scene_are_not_taken_for_those_of_another() -> None:
     fragments = ops.trace(projections[1])
     with pytest.raises(ValueError, match="those of 9 surfels, not of 3"):
         ops.blended_image(fragments, projections[0], torch.rand(9, 3))
-    with pytest.raises(ValueError, match="those of 9 surfels, not of 3"):
-        ops.masked_counts(fragments, torch.ones(192, dtype=torch.bool), 3)
     with pytest.raises(ValueError, match="base must have shape"):
         ops.blended_image(fragments, projections[1], torch.rand(3, 3))
     for radii in (projections[1].radii.double(), projections[1].radii[:-1]):

@@ -1,10 +1,10 @@
 #!/usr/bin/env python
 """Transfer the package to a bare machine with a GPU, and run tests and benchmarks there.
 
-`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies
-except torch and numpy, and sorts them into parts FOLDER/0, FOLDER/1, ... of limited size. `card.py run
-ORDER... --stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has its own time
-limit."""
+`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies and
+nerfstudio, except torch and numpy, and archives them in parts FOLDER/part.00, FOLDER/part.01, ... of limited size.
+`card.py run ORDER... --stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has
+its own time limit."""
 
 import argparse
 import os
@@ -26,7 +26,6 @@ NEEDED += ("pycolmap", "pillow-heif")
 """Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt."""
 TOOLS = ("scikit-build-core", "nanobind", "cmake", "ninja", "numpy")
 BLOCKS = "from bitymi_ns import _cuda; print(repr(_cuda.device_problem(0)), _cuda.draws_bc7())"
-CHECKED = ("baked", "training", "texels", "listed")  # sections of `times.py cuda`
 SANITIZERS = ("memcheck", "racecheck", "initcheck", "synccheck")
 ORDERS = ("check", "webgpu", "train", "frames")
 
@@ -59,7 +58,7 @@ def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (),
             Step("block textures", [sys.executable, "-c", BLOCKS], 60),
             Step("tests", [*pytest, "tests/cuda", "-k", "not emulated"], 240),
             Step("kernels", [*times, "cuda", *large], 90),
-            *(Step(tool, [*sanitizer, tool, *times, "cuda", "--sections", *CHECKED], 150) for tool in SANITIZERS),
+            *(Step(tool, [*sanitizer, tool, *times, "cuda"], 150) for tool in SANITIZERS),
         ]
     if order == "webgpu":
         return [Step("webgpu tests", [*pytest, "tests/ops/webgpu"], 60)]
@@ -76,61 +75,47 @@ def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (),
     return steps
 
 
-def stage(arguments: argparse.Namespace) -> int:
-    """Collect the wheels and LPIPS's weights in parts, see above."""
-    folder = arguments.folder.resolve()
-    folder.mkdir(parents=True, exist_ok=True)
-    for file in folder.glob("*/*"):
-        file.rename(folder / file.name)
+def stage(arguments: argparse.Namespace) -> None:
+    """Collect the wheels and LPIPS's weights and archive them in parts, see above."""
     kept = ROOT / "build" / f"card-{Path(arguments.python).name}"
-    tools = kept / "tools"
+    tools, wheels = kept / "tools", kept / "wheels"
+    wheels.mkdir(parents=True, exist_ok=True)
     if not tools.exists():
         subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
         subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
     pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
-    for old in folder.glob("bitymi_ns-*.whl"):
+    for old in wheels.glob("bitymi_ns-*.whl"):
         old.unlink()
     architectures = f"cmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}"
     settings = ("cmake.define.BITYMI_CUDA=ON", architectures, f"build-dir={kept / 'build'}")
     options = [f"--config-settings={setting}" for setting in settings]
-    wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(folder), str(ROOT)]
+    wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(wheels), str(ROOT)]
     subprocess.run([*wheel, *options], check=True)
-    fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(folder), "-c", f"{ROOT}/constraints.txt"]
+    fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(wheels), "-c", f"{ROOT}/constraints.txt"]
     for name in NEEDED:
-        if not list(folder.glob(f"{name.replace('-', '_')}-*.whl")):
+        if not list(wheels.glob(f"{name.replace('-', '_')}-*.whl")):
             with_needs = [] if name == "pydantic" else ["--no-deps"]
             subprocess.run([*fetched, *with_needs, name], check=True)
     from bitymi_ns.plugin.run import lpips  # lazily: `run` starts without this package
 
     lpips.load("alex")
-    shutil.copy(lpips.weights_path("alex"), folder)
-    for part, files in enumerate(parts(folder, 1e6 * arguments.megabytes)):
-        for file in files:
-            print(f"{part} {file.stat().st_size / 1e6:8.2f} MB  {file.name}")
-            (folder / str(part)).mkdir(exist_ok=True)
-            file.rename(folder / str(part) / file.name)
-    return 0
+    shutil.copy(lpips.weights_path("alex"), wheels)
+    archive(wheels, arguments.folder, arguments.megabytes)
 
 
-def parts(folder: Path, most: float) -> list[list[Path]]:
-    """Split the files of a folder, largest first, into lists of at most `most` bytes each."""
-    lists: list[list[Path]] = []
-    for file in sorted(filter(Path.is_file, folder.iterdir()), key=lambda file: -file.stat().st_size):
-        sizes = [sum(other.stat().st_size for other in files) for files in lists]
-        fitting = [files for files, size in zip(lists, sizes, strict=True) if size + file.stat().st_size <= most]
-        if not fitting:
-            lists.append(new := [])
-            fitting = [new]
-        fitting[0].append(file)
-    return lists
+def archive(wheels: Path, folder: Path, megabytes: int) -> None:
+    """Write an archive of a folder in parts of at most so many megabytes."""
+    folder.mkdir(parents=True)
+    packed = subprocess.run(["tar", "-C", wheels, "-c", "."], capture_output=True, check=True).stdout
+    subprocess.run(["split", "-d", "-b", f"{megabytes}MB", "-", folder / "part."], input=packed, check=True)
 
 
 def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
     """Install the wheels to a folder, copy the checkout with their compiled modules, and return the environment."""
-    site = work / "site"
+    site, packed = work / "site", b"".join(part.read_bytes() for part in sorted(staged, key=lambda part: part.name))
+    subprocess.run(["tar", "-C", work, "-x"], input=packed, check=True)
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-compile", "--target"]
-    wheels = [str(file) for folder in staged for file in folder.glob("**/*.whl")]
-    subprocess.run([*command, str(site), *wheels], check=True)
+    subprocess.run([*command, site, *work.glob("*.whl")], check=True)
     tree = work / "tree"
     tree.mkdir()
     for name in CARRIED:
@@ -141,13 +126,15 @@ def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
     shutil.rmtree(site / "bitymi_ns")
     cache = work / "cache/bitymi-ns"
     cache.mkdir(parents=True)
-    for file in (file for folder in staged for file in folder.glob("**/*.npz")):
+    for file in work.glob("*.npz"):
         shutil.copy(file, cache)
-    path = os.pathsep.join([str(tree), str(site), *filter(None, [os.environ.get("PYTHONPATH")])])
-    programs = os.pathsep.join([str(site / "bin"), os.environ["PATH"]])
-    changed = {"PATH": programs, "PYTHONPATH": path, "XDG_CACHE_HOME": str(cache.parent)}
-    changed["BITYMI_TESTS_REQUIRE"] = "card"  # else tests/cuda would be skipped without a GPU
-    return {**os.environ, **changed}
+    return {
+        **os.environ,
+        "PATH": f"{site / 'bin'}{os.pathsep}{os.environ['PATH']}",
+        "PYTHONPATH": os.pathsep.join([str(tree), str(site), *filter(None, [os.environ.get("PYTHONPATH")])]),
+        "XDG_CACHE_HOME": str(cache.parent),
+        "BITYMI_TESTS_REQUIRE": "card",  # else tests/cuda would be skipped without a GPU
+    }
 
 
 def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, deadline: float) -> str:
@@ -177,13 +164,13 @@ def main() -> int:
     )
     commands = parser.add_subparsers(dest="command", required=True)
     staging = commands.add_parser("stage", help="make the folder of wheels")
-    staging.add_argument("folder", type=Path)
+    staging.add_argument("folder", type=Path, help="must not exist")
     staging.add_argument("--python", default=sys.executable, help="a Python of the machine's version (%(default)s)")
     staging.add_argument("--architectures", default="90", help="compute capabilities of its card (%(default)s)")
-    staging.add_argument("--megabytes", type=float, default=38, help="most of a part (%(default)s)")
+    staging.add_argument("--megabytes", type=int, default=38, help="most of a part (%(default)s)")
     running = commands.add_parser("run", help="run orders on the machine")
     running.add_argument("orders", nargs="+", metavar="ORDER", choices=ORDERS, help=", ".join(ORDERS))
-    running.add_argument("--stage", type=Path, nargs="+", required=True, help="folders of wheels")
+    running.add_argument("--stage", type=Path, nargs="+", required=True, help="the parts")
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
     running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")
@@ -191,13 +178,14 @@ def main() -> int:
     running.add_argument("--seconds", type=float, default=570, help="for all of it (%(default)s)")
     arguments = parser.parse_args()
     if arguments.command == "stage":
-        return stage(arguments)
+        stage(arguments)
+        return 0
     deadline = time.monotonic() + arguments.seconds
     results = arguments.output.resolve()
     results.mkdir(parents=True, exist_ok=True)
     lines = ["| step | exit status | s |", "|---|---|---:|"]
     with tempfile.TemporaryDirectory() as work:
-        environment = unpack([folder.resolve() for folder in arguments.stage], Path(work))
+        environment = unpack(arguments.stage, Path(work))
         for order in arguments.orders:
             for step in steps_of(order, results, arguments.data.resolve(), arguments.surfels, arguments.steps):
                 lines.append(run_step(step, Path(work) / "tree", environment, results, deadline))

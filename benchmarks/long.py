@@ -96,13 +96,10 @@ class LongRun:
         kind, _, bundle = cell.partition(" ")
         key = {"cell": kind, "row": self.row, "scene": self.scene, "settings": self.row, "steps": self.steps}
         key |= {name: getattr(self.options, name) for name in ("photographs", "bake", "align", "megabytes")}
-        key |= {"seed": self.seed, "device": device_name(self.options.device), "commit": commit()}
+        device = self.options.device  # a GPU's model, or cpu
+        device = "cpu" if device == "cpu" else torch.cuda.get_device_name(device)
+        key |= {"seed": self.seed, "device": device, "commit": commit()}
         return key | ({"bundle": bundle} if bundle else {})
-
-
-def device_name(device: str) -> str:
-    """Return the GPU's model, or cpu."""
-    return torch.cuda.get_device_name(device) if torch.device(device).type == "cuda" else "cpu"
 
 
 def preset_of(row: str) -> Preset:
@@ -134,19 +131,14 @@ def quality(draw: Callable[[Camera], Any], views: Sequence[View], background: Te
 
 
 def peak_bytes(device: torch.device) -> float:
-    """Read the most memory since the last `forget_peak`: a GPU's tensors, or the whole process on a CPU."""
+    """Read the most memory since the last call: a GPU's tensors, or the whole process on a CPU."""
     if device.type == "cuda":
-        return torch.cuda.max_memory_allocated(device)
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
-
-
-def forget_peak(device: torch.device) -> None:
-    """Begin a new peak of `peak_bytes`."""
-    if device.type == "cuda":
+        most = torch.cuda.max_memory_allocated(device)
         torch.cuda.reset_peak_memory_stats(device)
-    else:
-        Path("/proc/self/clear_refs").write_text("5")
+        return most
+    lines = Path("/proc/self/status").read_text().splitlines()
+    Path("/proc/self/clear_refs").write_text("5")
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
 
 
 load = functools.lru_cache(maxsize=1)(load_capture)
@@ -161,7 +153,7 @@ def measure(run: LongRun) -> Figures:
     capture = replace(capture, train=[capture.train[i] for i in kept])  # held-out ones do not change
     if capture.white:
         preset.train.alpha_color = "white"
-    forget_peak(device)
+    peak_bytes(device)
     torch.manual_seed(run.seed)
     first = (capture.train, capture.points, capture.colours, preset.scene, preset.train, run.steps)
     scene = scene_for_views(*first).to(device)

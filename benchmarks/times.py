@@ -3,8 +3,6 @@
 
 import math
 import os
-import shlex
-import shutil
 import statistics
 import sys
 import time
@@ -25,12 +23,10 @@ from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.measure.bench.process import CommandFailed, run_measured, say, tool
+from bitymi_ns.measure.bench.cli import BenchRun
+from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.markdown import number, page, publish, table
-from bitymi_ns.measure.report.read import collect
-from bitymi_ns.measure.report.tables import quality_markdown
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.ops.baked import IMAGES
 from bitymi_ns.ops.baked_cuda import Stage
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import geometry_of
@@ -258,11 +254,9 @@ def frames(
     publish(page("Frames of baked scenes", table(HEADER, rows), notes), output)
 
 
-def baked(n: int, width: int, height: int, device: torch.device, every: bool = False) -> Run:
-    """Prepare a frame with a BC7 atlas; `every`: with all images."""
+def baked(n: int, width: int, height: int, device: torch.device) -> Run:
+    """Prepare a frame with a BC7 atlas."""
     scene, camera = textured(n, width, height, device)
-    if every:
-        return lambda: scene.render_views([camera], None, tuple(IMAGES))
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
     return renderer.run
@@ -287,28 +281,19 @@ def training(n: int, width: int, height: int, device: torch.device, tiled: bool 
     return run
 
 
-def exact(n: int, width: int, height: int, device: torch.device) -> Run:
-    """Prepare a training step of either texture with deterministic sums."""
-    steps = [training(n, width, height, device, tiled) for tiled in (False, True)]
-
-    def run() -> None:
-        torch.use_deterministic_algorithms(True, warn_only=True)  # some of torch's own operations have none
-        for step in steps:
-            step()
-        torch.use_deterministic_algorithms(False)
-
-    return run
-
-
-SECTIONS = {"baked": baked, "images": partial(baked, every=True), "training": training}
-SECTIONS |= {"texels": partial(training, tiled=True), "listed": partial(training, tiled=True, most=1 << 30)}
-SECTIONS |= {"deterministic": exact}
+Section = Literal["baked", "training", "texels", "listed"]
+SECTIONS: dict[Section, Callable[[int, int, int, torch.device], Run]] = {
+    "baked": baked,
+    "training": training,
+    "texels": partial(training, tiled=True),
+    "listed": partial(training, tiled=True, most=1 << 30),
+}
 
 
 def cuda(
     surfels: int = 300,
     size: tuple[int, int] = (96, 64),
-    sections: tuple[Literal["baked", "images", "training", "texels", "listed", "deterministic"], ...] = (),
+    sections: tuple[Section, ...] = tuple(SECTIONS),
     times: int = 0,
 ) -> None:
     """Run each CUDA kernel once on a small scene, for sanitizers, or print its device time.
@@ -316,12 +301,12 @@ def cuda(
     Args:
         surfels: Size of the scene.
         size: Width and height of the image.
-        sections: Select kernels; none = all.
+        sections: Kernels to run.
         times: Time by kernel over so many runs.
     """
     device = gpu()
     activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
-    for name in sections or SECTIONS:
+    for name in sections:
         run = SECTIONS[name](surfels, *size, device)
         for _ in range(5 if times else 1):
             run()
@@ -337,48 +322,18 @@ def cuda(
 
 
 def nerfstudio(
-    data: tyro.conf.Positional[Path], folder: Path, steps: int = 3000, options: str = "", output: Path | None = None
+    data: tyro.conf.Positional[Path], steps: int = 3000, extra: str = "", work: Path = Path("outputs/times")
 ) -> int:
-    """Run nerfstudio's commands on a capture and tabulate their cost: train, resume, evaluate, export, evaluate and
-    render the bundle. Returns 1 if one fails, which ends the others.
+    """Run nerfstudio's commands on a capture, with the cells of `bitymi bench`: train, evaluate, export to BC7,
+    evaluate the bundle; tabulate quality, seconds and memory.
 
     Args:
         data: Folder of a capture.
-        folder: Folder of runs, bundle and logs; emptied first.
         steps: Length of the run.
-        options: Further options of ns-train, as one word.
-        output: Also write the Markdown to this file.
+        extra: Further options of ns-train, as one word.
+        work: Folder of runs, bundles, logs and finished cells.
     """
-    folder, half, run = folder.resolve(), max(1, steps // 2), "outputs/capture/bitymi/whole"
-    shutil.rmtree(folder, ignore_errors=True)
-    train = ["ns-train", "bitymi", "--data", str(data.resolve()), "--max-num-iterations", str(steps)]
-    train += "--output-dir outputs --experiment-name capture --vis tensorboard --timestamp".split()
-    kept = f"--steps-per-save {half} --save-only-latest-checkpoint False".split()
-    checkpoint = f"--load-dir {run}/nerfstudio_models --load-step {half}".split()
-    bundle = "--load-config bundle/config.yml"
-    commands = [
-        [*train, "whole", *kept, *shlex.split(options)],
-        [*train, "resumed", *checkpoint, *shlex.split(options)],
-        f"ns-eval --load-config {run}/config.yml --output-path trained.json".split(),
-        f"ns-export bitymi-atlas --load-config {run}/config.yml --output-dir bundle".split(),
-        f"ns-eval {bundle} --output-path baked.json".split(),
-        f"ns-render dataset {bundle} --output-path maps --rendered-output-names rgb depth".split(),
-    ]
-    rows = []
-    try:
-        for i, command in enumerate(commands):
-            cost = run_measured([tool(command[0]), *command[1:]], folder / f"{i}.log", cwd=folder)
-            costs = (cost["process_seconds"], cost["process_cpu_seconds"], cost["peak_bytes"] / 1e6)
-            rows.append([f"`{shlex.join(command)}`", *(number(figure, 0) for figure in costs)])
-            say(rows[-1][0])
-    except CommandFailed as error:
-        say(str(error))
-    finally:  # an interrupted run leaves its results
-        found = [file for file in (folder / "trained.json", folder / "baked.json") if file.is_file()]
-        quality = quality_markdown(collect(found, folder).evaluations) if found else ""
-        costs = table(("command", "s", "CPU s", "MB"), rows)
-        publish(page(f"nerfstudio on {data.resolve().name}, {steps} steps", f"{costs}\n\n{quality}"), output)
-    return 0 if len(rows) == len(commands) else 1
+    return BenchRun((data,), steps=steps, extra=extra, formats=("bc7",), work=work).run()
 
 
 if __name__ == "__main__":

@@ -40,12 +40,12 @@ def versions() -> dict[str, str]:
 
 @functools.cache
 def processor() -> str:
-    model = platform.processor() or platform.machine()
-    try:
-        lines = Path("/proc/cpuinfo").read_text("utf8").splitlines()
-    except OSError:
-        return model
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), model)
+    """Return the processor's model."""
+    with suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text("utf8").splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    return platform.processor() or platform.machine()
 
 
 @functools.cache

@@ -9,7 +9,7 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.measure.bench.engine import CURVE, train_command
-from bitymi_ns.measure.bench.matrix import CellSpec, MethodSpec, standard_scenes
+from bitymi_ns.measure.bench.matrix import Cell, standard_scenes
 from bitymi_ns.measure.report.read import read_jsonl
 from tests.captures import colmap_model
 
@@ -26,7 +26,7 @@ def colmap_scene(room: Path, folder: Path) -> None:
     shutil.copytree(room / "images", folder / "images_2")
 
 
-def train(work: Path, run: CellSpec, monkeypatch: pytest.MonkeyPatch) -> Path:
+def train(work: Path, run: Cell, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Run a training command in this process; returns its config.yml."""
     monkeypatch.setattr(sys, "argv", train_command(work, run))
     ns_train.entrypoint()
@@ -36,7 +36,7 @@ def train(work: Path, run: CellSpec, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     colmap_scene(room, tmp_path / "360" / "bonsai")
     (scene,) = standard_scenes("mipnerf360", tmp_path / "360", ["bonsai"])
-    run = CellSpec(scene, MethodSpec("small", "bitymi", SMALL), seed=3, steps=2)
+    run = Cell(**vars(scene), method="bitymi", options=SMALL, seed=3, steps=2)
     path = train(tmp_path / "work", run, monkeypatch)
     (curve,) = read_jsonl(path.with_name(CURVE)).curves
     assert curve.scene == "bonsai"

@@ -12,7 +12,7 @@ def test_a_value_that_is_missing_is_an_error() -> None:
 
 
 def test_markdown_is_not_escaped() -> None:
-    names = ("rim", "probes", "accurate", "steps", "allowance", "picture", "sweeps", "nothing", "verdicts")
-    cases = {"plain": "| a | b |", "texels": "<2", "alpha": ""}
+    names = ("rim", "probes", "accurate", "steps", "allowance", "picture", "nothing", "verdicts")
+    cases = {"plain": "| a | b |", "texels": "<2", "alpha": "", "sweeps": ""}
     page = rendered("stability.md.j2", backend="<a>", cases=cases, **dict.fromkeys(names, "<1"))
     assert "backend `<a>`" in page and "\n\n| a | b |\n" in page and "<2" in page

@@ -2,30 +2,21 @@
 
 import os
 import re
+import subprocess
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
-import pytest
 
-
-@pytest.mark.parametrize(("program", "status"), [("true", 0), ("false", 1)])
-def test_nerfstudios_commands_are_tabled(
-    load: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch, tmp_path: Path, program: str, status: int
-) -> None:
-    times, page = load("times"), tmp_path / "page.md"
-    monkeypatch.setattr(times, "tool", lambda name: program)
-    assert times.nerfstudio(tmp_path / "fox", tmp_path / "runs", steps=4, output=page) == status
-    assert page.read_text("utf8").count("| `ns-") == (0 if status else 6)
-
-
-def test_wheels_are_parted_by_size(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
-    for name, size in {"a": 30, "b": 20, "c": 15, "d": 5, "e": 50}.items():
-        (tmp_path / name).write_bytes(bytes(size))
-    parts = load("card").parts(tmp_path, 45)
-    assert [[file.name for file in part] for part in parts] == [["e"], ["a", "c"], ["b", "d"]]
+def test_wheels_are_archived_in_parts(load: Callable[[str], ModuleType], tmp_path: Path) -> None:
+    (tmp_path / "wheels").mkdir()
+    (tmp_path / "wheels/a.whl").write_bytes(os.urandom(1_500_000))
+    load("card").archive(tmp_path / "wheels", tmp_path / "stage", 1)
+    parts = sorted((tmp_path / "stage").iterdir())
+    subprocess.run(["tar", "-C", tmp_path, "-x"], input=b"".join(map(Path.read_bytes, parts)), check=True)
+    assert len(parts) == 2 and (tmp_path / "a.whl").read_bytes() == (tmp_path / "wheels/a.whl").read_bytes()
 
 
 def test_the_table_of_a_run_says_why_a_command_failed(load: Callable[[str], ModuleType], tmp_path: Path) -> None:

@@ -3,7 +3,7 @@
 import os
 import shlex
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
@@ -12,16 +12,7 @@ import tyro
 from bitymi_ns.files import check_writable, write_errors_as
 from bitymi_ns.measure.bench.cells import FILE, Cells
 from bitymi_ns.measure.bench.engine import run_chains
-from bitymi_ns.measure.bench.matrix import (
-    BundleSpec,
-    Chain,
-    Format,
-    MethodSpec,
-    chains,
-    local_scenes,
-    read_plan,
-    standard_scenes,
-)
+from bitymi_ns.measure.bench.matrix import Chain, Format, Plan, Row, chains, local_scenes, read_plan, standard_scenes
 from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.markdown import page, publish
 from bitymi_ns.measure.report.read import add_cells
@@ -57,12 +48,11 @@ class BenchRun:
         which."""
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
-        rows, bundles = read_plan(self.plan) if self.plan else ([MethodSpec(name, name) for name in self.methods], None)
-        if not rows:
-            raise BenchError("nothing to run: give --methods or --plan")
-        rows = [replace(row, options=(*row.options, *shlex.split(self.extra))) for row in rows]
-        if bundles is None:
-            bundles = [BundleSpec(name, ("--format", name)) for name in dict.fromkeys(self.formats)]
+        own = {name: Row.model_construct(method=name, options=[]) for name in self.methods}
+        plan = read_plan(self.plan) if self.plan else Plan.model_construct(rows=own, bundles=None)
+        for row in plan.rows.values():
+            row.options += shlex.split(self.extra)
+        bundles = {name: ("--format", name) for name in self.formats} if plan.bundles is None else plan.bundles
         if self.suite != "local":
             if len(self.data) != 1:
                 raise BenchError(f"--data is one folder: the one that holds the scenes of {self.suite}")
@@ -71,7 +61,7 @@ class BenchRun:
             raise BenchError("--scenes chooses scenes of a standard data set; name your captures with --data")
         else:
             scenes = local_scenes(self.data)
-        return chains(scenes, rows, self.seeds, self.steps, bundles)
+        return chains(scenes, plan.rows, bundles, self.seeds, self.steps)
 
     def run(self) -> int:
         """Run the missing cells, print the table, and return the exit status."""

@@ -10,7 +10,7 @@ from typing import Any, NoReturn
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.locks import Busy, Lock
 from bitymi_ns.measure.bench.cells import FILE, Cells, provenance
-from bitymi_ns.measure.bench.matrix import CellSpec, Chain
+from bitymi_ns.measure.bench.matrix import Cell, Chain
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool
 from bitymi_ns.measure.report.read import read_jsonl
 from bitymi_ns.safe_reading import read_json, reading
@@ -18,82 +18,76 @@ from bitymi_ns.safe_reading import read_json, reading
 CURVE = "training_curve.jsonl"
 
 
-def train_command(work: Path, run: CellSpec) -> list[str]:
+def train_command(work: Path, run: Cell) -> list[str]:
     """Build the command line of ns-train, without viewer, with the run's seed for all generators."""
-    command = [tool("ns-train"), run.row.method, "--output-dir", str(work / "runs")]
-    command += ["--experiment-name", run.scene.name, "--timestamp", run.run_name, "--vis", "none"]
+    command = [tool("ns-train"), run.method, "--output-dir", str(work / "runs")]
+    command += ["--experiment-name", run.scene, "--timestamp", run.run_name, "--vis", "none"]
     if run.steps is not None:
         command += ["--max-num-iterations", str(run.steps)]
-    if run.seed is not None:
-        command += ["--machine.seed", str(run.seed)]
-        if run.row.ours:
-            command += ["--pipeline.model.train.seed", str(run.seed)]
-            command += ["--pipeline.datamanager.train-cameras-sampling-seed", str(run.seed)]
-    command += run.row.options
-    parser, options = run.scene.parser[:1], run.scene.parser[1:]
-    return [*command, *parser, "--data", str(run.scene.data), *options]
+    seeded = ["machine.seed"]
+    if run.ours:
+        seeded += ["pipeline.model.train.seed", "pipeline.datamanager.train-cameras-sampling-seed"]
+    for option in seeded if run.seed is not None else ():
+        command += [f"--{option}", str(run.seed)]
+    return [*command, *run.options, *run.parser[:1], "--data", run.data, *run.parser[1:]]
 
 
-def command_of(work: Path, cell: CellSpec) -> list[str]:
+def command_of(work: Path, cell: Cell) -> list[str]:
     """Build the command line of a cell."""
-    if cell.kind == "train":
+    if cell.cell == "train":
         return train_command(work, cell)
     config, output = ("--load-config", str(work / cell.parent.output / "config.yml")), str(work / cell.output)
-    if cell.bundle is not None and cell.kind == "export":
-        return [tool("ns-export"), "bitymi-atlas", *config, "--output-dir", output, *cell.bundle.options]
-    pictures = output.removesuffix(".json")
-    return [tool("ns-eval"), *config, "--output-path", output, "--render-output-path", pictures]
+    if cell.cell == "export":
+        return [tool("ns-export"), "bitymi-atlas", *config, "--output-dir", output, *cell.export]
+    pictures = ("--render-output-path", output.removesuffix(".json"))
+    return [tool("ns-eval"), *config, "--output-path", output, *pictures]
 
 
-def read_result(work: Path, cell: CellSpec) -> dict[str, Any]:
+def read_result(work: Path, cell: Cell) -> dict[str, Any]:
     """Read the figures of a finished command.
 
     train: `steps`, `seconds` and `cpu_seconds` of the training steps only (no loading, evaluation or saving),
     `surfels`, `fragments`, `curve`. export: `bytes`, `files`, `format` and `statistics` of the bundle. eval:
     nerfstudio's `results`, means over the held-out views, and the folder of their `pictures`. Raises CommandFailed:
     there are no readable figures."""
-    with reading(work / cell.output, _refuse):
-        if cell.kind == "train":
-            return _training(work, cell.output / CURVE) if cell.row.ours else {}
-        if cell.kind == "export":
-            return _export(work / cell.output)
-        results = read_json(work / cell.output)["results"]
-        return {"results": {**results, "psnr": results["psnr"]}, "pictures": cell.output.with_suffix("").as_posix()}
+    output = work / cell.output
+    with reading(output, _refuse):
+        if cell.cell == "export":
+            from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch, not needed for others
+
+            info = read_manifest(output)
+            compact = info.surfels.columns is not None
+            return {
+                "bytes": download_bytes(output, info),
+                "files": {name: entry.bytes for name, entry in info.files.items()},
+                "format": None if info.atlas is None else "compact" if compact else info.atlas.format,
+                "statistics": info.statistics.model_dump(mode="json"),
+            }
+        if cell.cell == "eval":
+            results = read_json(output)["results"]
+            pictures = cell.output.with_suffix("").as_posix()
+            return {"results": {**results, "psnr": results["psnr"]}, "pictures": pictures}
+        if not cell.ours:
+            return {}
+        (curve,) = read_jsonl(output / CURVE).curves
+        figures = {name: curve.last(name) for name in ("seconds", "cpu_seconds", "surfels", "fragments")}
+        return {"steps": curve.last("step"), **figures, "curve": (cell.output / CURVE).as_posix()}
 
 
 def _refuse(message: str, cause: BaseException) -> NoReturn:
     raise CommandFailed(message) from cause
 
 
-def _training(work: Path, path: Path) -> dict[str, Any]:
-    curve = read_jsonl(work / path).curves[0]
-    figures = {name: curve.last(name) for name in ("seconds", "cpu_seconds", "surfels", "fragments")}
-    return {"steps": curve.last("step"), **figures, "curve": path.as_posix()}
-
-
-def _export(folder: Path) -> dict[str, Any]:
-    from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch, not needed for other methods
-
-    info = read_manifest(folder)
-    compact = info.surfels.columns is not None
-    return {
-        "bytes": download_bytes(folder, info),
-        "files": {name: entry.bytes for name, entry in info.files.items()},
-        "format": None if info.atlas is None else "compact" if compact else info.atlas.format,
-        "statistics": info.statistics.model_dump(mode="json"),
-    }
-
-
-def missing(chain: Chain, cells: Cells) -> list[CellSpec]:
+def missing(chain: Chain, cells: Cells) -> list[Cell]:
     """List the cells of a run to execute: those not finished, and those that depend on these."""
-    pending: list[CellSpec] = []
+    pending: list[Cell] = []
     for cell in chain:
         if cells.get(cell.key) is None or cell.parent in pending:
             pending.append(cell)
     return pending
 
 
-def lock_of(work: Path, run: CellSpec) -> Lock:
+def lock_of(work: Path, run: Cell) -> Lock:
     """Lock a run against other processes. Raises CommandFailed: another process holds the lock."""
     path = work / "locks" / f"{run.folder.replace('/', '--')}.lock"
     with write_errors_as(work, BenchError, ", with --work"):
@@ -104,14 +98,14 @@ def lock_of(work: Path, run: CellSpec) -> Lock:
             raise CommandFailed(f"{run.run}: {error}") from error
 
 
-def _run_cell(work: Path, cell: CellSpec, cells: Cells, lock: Lock) -> None:
+def _run_cell(work: Path, cell: Cell, cells: Cells, lock: Lock) -> None:
     command, output = command_of(work, cell), work / cell.output
-    if cell.kind == "eval":  # the folder also holds other evaluations
+    if cell.cell == "eval":  # the folder also holds other evaluations
         output.parent.mkdir(parents=True, exist_ok=True)
     else:
         shutil.rmtree(output, ignore_errors=True)  # output of an earlier attempt
     start = time.perf_counter()
-    cost = run_measured(command, work / "logs" / cell.folder / f"{cell.kind}-{cell.form}.log", lock)
+    cost = run_measured(command, work / "logs" / cell.folder / f"{cell.cell}-{cell.form}.log", lock)
     cells.add(cell.key, {**read_result(work, cell), **cost}, provenance(command, time.perf_counter() - start))
 
 
@@ -130,7 +124,7 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
     for chain in chains:
         if not missing(chain, cells):
             continue
-        broken: list[CellSpec] = []
+        broken: list[Cell] = []
         try:
             with lock_of(work, chain[0]) as lock:
                 cells.refresh()

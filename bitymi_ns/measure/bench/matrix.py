@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -19,68 +19,59 @@ from bitymi_ns.presets import preset_names
 from bitymi_ns.ranges import describe_problems
 from bitymi_ns.safe_reading import read_text, reading
 
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")]
+Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atlas`
+
 
 @dataclass(frozen=True)
-class SceneSpec:
+class Scene:
     """A capture and its dataparser."""
 
-    name: str  # label in tables, and nerfstudio's experiment name
-    data: Path  # absolute folder
+    scene: str  # label in tables, and nerfstudio's experiment name
+    data: str  # absolute folder
     suite: str = "local"  # name of the data set, or `local`
     parser: tuple[str, ...] = ()  # nerfstudio's dataparser and its options; empty: the method's own
 
 
-@dataclass(frozen=True)
-class MethodSpec:
-    """A method of the bench: its nerfstudio method with further options of ns-train."""
+class Row(BaseModel):
+    """A method of nerfstudio with further options of ns-train."""
 
-    name: str
-    method: str
+    model_config = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
+    method: Name
+    options: list[str] = []
+
+
+class Plan(BaseModel):
+    """Rows to train by name, and bundles to bake: named options of `ns-export bitymi-atlas`; None: not stated."""
+
+    model_config = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
+    rows: Annotated[dict[str, Row], Field(min_length=1)]
+    bundles: dict[Name, list[str]] | None = None
+
+
+@dataclass(frozen=True)
+class Cell(Scene):
+    """A cell of the matrix: a training run, or an evaluation or export of its scene or of a bundle. Its fields are all
+    settings that affect its result."""
+
+    row: str = ""
+    method: str = ""
     options: tuple[str, ...] = ()
+    seed: int | None = None  # None: the method's own
+    steps: int | None = None  # length of the run; None: the method's own for this machine
+    cell: Literal["train", "eval", "export"] = "train"
+    bundle: str = ""
+    export: tuple[str, ...] = ()  # options of the bundle
+
+    @property
+    def key(self) -> dict[str, Any]:
+        """The settings as they are stored."""
+        return {name: value for name, value in vars(self).items() if self.bundle or name not in ("bundle", "export")}
 
     @property
     def ours(self) -> bool:
         """True for a method of this package; only these are baked and have a training curve."""
         return self.method in preset_names()
-
-
-@dataclass(frozen=True)
-class BundleSpec:
-    """Named options of `ns-export bitymi-atlas`."""
-
-    name: str
-    options: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class CellSpec:
-    """A cell of the matrix: a training run, or an evaluation or export of its scene or of a bundle."""
-
-    scene: SceneSpec
-    row: MethodSpec
-    seed: int | None = None  # None: the method's own
-    steps: int | None = None  # length of the run; None: the method's own for this machine
-    kind: Literal["train", "eval", "export"] = "train"
-    bundle: BundleSpec | None = None
-
-    @property
-    def key(self) -> dict[str, Any]:
-        """All settings that affect the result of the cell."""
-        key: dict[str, Any] = {
-            "cell": self.kind,
-            "suite": self.scene.suite,
-            "row": self.row.name,
-            "scene": self.scene.name,
-            "data": str(self.scene.data),
-            "parser": list(self.scene.parser),
-            "method": self.row.method,
-            "options": list(self.row.options),
-            "steps": self.steps,
-            "seed": self.seed,
-        }
-        if self.bundle is not None:
-            key |= {"bundle": self.bundle.name, "export": list(self.bundle.options)}
-        return key
 
     @property
     def run_name(self) -> str:
@@ -92,59 +83,57 @@ class CellSpec:
     @property
     def folder(self) -> str:
         """Path of the run below runs/, bundles/, evals/ and logs/ of the work folder."""
-        return f"{self.scene.name}/{self.row.method}/{self.run_name}"
+        return f"{self.scene}/{self.method}/{self.run_name}"
 
     @property
     def form(self) -> str:
         """Name of the bundle, or `trained`."""
-        return self.bundle.name if self.bundle else "trained"
+        return self.bundle or "trained"
 
     @property
     def output(self) -> Path:
         """Path in the work folder of the output: a folder, or the file of an evaluation, beside the folder of its
         pictures."""
         folders = {"train": Path("runs", self.folder), "export": Path("bundles", self.folder, self.form)}
-        return folders.get(self.kind, Path("evals", self.folder, f"{self.form}.json"))
+        return folders.get(self.cell, Path("evals", self.folder, f"{self.form}.json"))
 
     @property
-    def parent(self) -> "CellSpec":
+    def parent(self) -> "Cell":
         """The cell whose config.yml this one uses; the training itself for the training."""
-        if self.kind == "eval" and self.bundle is not None:
-            return replace(self, kind="export")
-        return replace(self, kind="train", bundle=None)
+        if self.cell == "eval" and self.bundle:
+            return replace(self, cell="export")
+        return replace(self, cell="train", bundle="", export=())
 
     @property
     def run(self) -> str:
         """Title of the run, for messages."""
-        return f"{self.scene.name}, {self.row.name}" + ("" if self.seed is None else f", seed {self.seed}")
+        return f"{self.scene}, {self.row}" + ("" if self.seed is None else f", seed {self.seed}")
 
     def __str__(self) -> str:
         what = {"train": "training", "eval": f"evaluation ({self.form})", "export": f"export ({self.form})"}
-        return f"{self.run}: {what[self.kind]}"
+        return f"{self.run}: {what[self.cell]}"
 
 
-Chain = list[CellSpec]  # the cells of one run; each may depend on those before it
+Chain = list[Cell]  # the cells of one run; each may depend on those before it
 
 
 def chains(
-    scenes: Sequence[SceneSpec],
-    rows: Sequence[MethodSpec],
+    scenes: Sequence[Scene],
+    rows: Mapping[str, Row],
+    bundles: Mapping[str, Sequence[str]],
     seeds: Sequence[int] = (),
     steps: int | None = None,
-    bundles: Sequence[BundleSpec] = (),
 ) -> list[Chain]:
     """List the cells of each run in the order of their dependencies: each row is trained on each scene with each seed
     (empty: once, with the method's own), then baked to each bundle."""
     listed: list[Chain] = []
-    for scene, row, seed in product(scenes, rows, list(seeds) or [None]):
-        train = CellSpec(scene, row, seed, steps)
-        listed.append([train, replace(train, kind="eval")])
-        for bundle in bundles if row.ours else ():
-            listed[-1] += [replace(train, kind="export", bundle=bundle), replace(train, kind="eval", bundle=bundle)]
+    for scene, (name, row), seed in product(scenes, rows.items(), list(seeds) or [None]):
+        train = Cell(**vars(scene), row=name, method=row.method, options=tuple(row.options), seed=seed, steps=steps)
+        listed.append([train, replace(train, cell="eval")])
+        for bundle, options in bundles.items() if train.ours else ():
+            export = replace(train, cell="export", bundle=bundle, export=tuple(options))
+            listed[-1] += [export, replace(export, cell="eval")]
     return listed
-
-
-Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atlas`
 
 
 class Suite(TypedDict):
@@ -173,7 +162,7 @@ def suites() -> dict[str, Suite]:
     return _read(Path(__file__).with_name("suites.yaml"))
 
 
-def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
+def local_scenes(folders: Sequence[Path]) -> list[Scene]:
     """List captures in any format that `ns-train bitymi --data` accepts. A Blender data set uses the points of its
     `hull_pc.ply`, if any. Raises BenchError: a folder is not a capture, two have the same name, or there is none."""
     if not folders:
@@ -182,21 +171,21 @@ def local_scenes(folders: Sequence[Path]) -> list[SceneSpec]:
     for folder in folders:
         folder = Path(os.path.expanduser(folder)).resolve()
         try:
-            found = recognise(folder)
+            capture = recognise(folder)
         except CaptureError as error:
             raise BenchError(f"{folder} is not a capture: {error}") from error
-        if found.format == "blender":
-            points = ("--ply-path", "hull_pc.ply") if (found.path / "hull_pc.ply").is_file() else ()
-            scenes.append(SceneSpec(folder.name, found.path, parser=("blender-data", *points)))
+        if capture.format == "blender":
+            points = ("--ply-path", "hull_pc.ply") if (capture.path / "hull_pc.ply").is_file() else ()
+            scenes.append(Scene(folder.name, str(capture.path), parser=("blender-data", *points)))
         else:
-            scenes.append(SceneSpec(folder.name, folder))
-    names = [scene.name for scene in scenes]
+            scenes.append(Scene(folder.name, str(folder)))
+    names = [scene.scene for scene in scenes]
     if len(set(names)) < len(names):
         raise BenchError(f"captures need folders of different names, not {', '.join(names)}")
     return scenes
 
 
-def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[SceneSpec]:
+def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[Scene]:
     """List the scenes of a standard data set. Raises BenchError: a scene does not exist, or its folder lacks required
     files."""
     suite, scenes = suites()[name], []
@@ -212,29 +201,13 @@ def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[Sce
                 f"{folder} is not {suite['title']}'s {scene}: there is no {' and no '.join(missing)}. --data is the "
                 f"folder that holds the scenes; --scenes {scene} ... chooses some of them"
             )
-        scenes.append(SceneSpec(scene, folder, name, tuple(suite["parser"].format(factor=factor).split())))
+        scenes.append(Scene(scene, str(folder), name, tuple(suite["parser"].format(factor=factor).split())))
     return scenes
 
 
-Words = list[str | int | float]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")]
-
-
-class _PlanRow(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-    method: Name
-    options: Words = []
-
-
-class _Plan(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-    rows: Annotated[dict[str | int | float, _PlanRow], Field(min_length=1)]
-    bundles: dict[Name, Words] | None = None
-
-
-def read_plan(name: str) -> tuple[list[MethodSpec], list[BundleSpec] | None]:
-    """Read a plan by name, or from a YAML file. Returns rows, and bundles or None if the plan states none. Raises
-    BenchError: the plan does not exist or is malformed; the message says where."""
+def read_plan(name: str) -> Plan:
+    """Read a plan by name, or from a YAML file. Raises BenchError: the plan does not exist or is malformed; the message
+    says where."""
     if name.endswith((".yaml", ".yml")):
         entry = _read(Path(os.path.expanduser(name)))
     else:
@@ -243,13 +216,9 @@ def read_plan(name: str) -> tuple[list[MethodSpec], list[BundleSpec] | None]:
             raise BenchError(f"there is no plan {name}: give {', '.join(plans)}, or a file that ends in .yaml")
         entry = plans[name]
     try:
-        plan = _Plan.model_validate(entry)
+        return Plan.model_validate(entry)
     except ValidationError as error:
         raise BenchError(
             f"plan {name}: {describe_problems(error)}; a plan has rows, NAME: {{method: NAME, options: [...]}}, and "
             "optionally bundles, NAME: [options of ns-export bitymi-atlas]"
         ) from error
-    rows = [MethodSpec(str(title), row.method, tuple(map(str, row.options))) for title, row in plan.rows.items()]
-    if plan.bundles is None:
-        return rows, None
-    return rows, [BundleSpec(title, tuple(map(str, options))) for title, options in plan.bundles.items()]

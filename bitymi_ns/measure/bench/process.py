@@ -25,9 +25,7 @@ class CommandFailed(BenchError):
     """A command failed; the message has the end of its log."""
 
 
-def run_measured(
-    command: Sequence[str], log: Path, lock: Lock | None = None, cwd: Path | None = None
-) -> dict[str, float]:
+def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) -> dict[str, float]:
     """Run a command with its output in a file; an interrupt terminates the command first.
 
     OpenMP threads wait without spinning, so that CPU seconds measure work.
@@ -35,7 +33,6 @@ def run_measured(
     Args:
         lock: inherited by the command and labelled with its process, so that it stays locked if only this process is
             killed.
-        cwd: working folder of the command; default: that of this process.
 
     Returns:
         `process_seconds`, `process_cpu_seconds` and `peak_bytes` of the command with all threads and children.
@@ -49,7 +46,6 @@ def run_measured(
         try:
             process = subprocess.Popen(
                 command,
-                cwd=cwd,
                 env={**os.environ, "OMP_WAIT_POLICY": "passive"},
                 stdin=subprocess.DEVNULL,
                 stdout=out,

@@ -18,8 +18,8 @@ from PIL import Image
 from bitymi_ns.measure.report.records import grouped
 from bitymi_ns.safe_reading import open_regular
 
-SIDE_BY_SIDE = re.compile(r"^eval_img_(?P<index>\d{4,})$", re.IGNORECASE)
-"""File name stem of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
+SIDE_BY_SIDE = re.compile(r"eval_img_(\d{4,})\.png$", re.IGNORECASE)
+"""File name of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
 ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
 MAX_SETS = 4  # sets of photographs per page
 MAX_WIDTH = 1200  # of embedded images, pixels
@@ -90,7 +90,7 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
     """
     folders: dict[Path, dict[int, View]] = {}
     for path in sorted(p.resolve() for p in images):
-        match = SIDE_BY_SIDE.match(path.stem)
+        match = SIDE_BY_SIDE.match(path.name)
         try:
             if match is None:
                 raise OSError("its name is not eval_img_ with a number, as ns-eval names a photograph beside a render")
@@ -101,33 +101,27 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
         squared = float(np.mean((photograph - render) ** 2, dtype=np.float64))
         digest = hashlib.sha256(photograph.tobytes()).digest()
         view = View(path, -10.0 * math.log10(max(1e-10, squared)), digest)
-        folders.setdefault(path.parent, {})[int(match["index"])] = view
+        folders.setdefault(path.parent, {})[int(match[1])] = view
     sets = list(grouped(folders, lambda f: tuple((i, view.digest) for i, view in folders[f].items())).values())
     if len(sets) > MAX_SETS:
         notes.append(f"Views of {len(sets) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
     shared = os.path.commonpath([folder.parent for folder in folders]) if folders else ""
     groups = []
     for members in sets[:MAX_SETS]:
-        names = sorted((os.path.relpath(folder, shared), folders[folder]) for folder in members)
-        groups += _compared(dict(names), len(sets) > 1)
-    return groups
-
-
-def _compared(folders: dict[str, dict[int, View]], named: bool) -> list[Group]:
-    """Encode the views of folders that show the same photographs; `named`: the folders are in the titles."""
-    first = next(iter(folders.values()))
-    ranked = sorted(first, key=lambda index: sum(views[index].psnr for views in folders.values()))
-    chosen: dict[int, str] = {}
-    for rank, quantile in RANKS.items():
-        chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], rank)
-    groups, title = [], f"{', '.join(folders)}: " if named else ""
-    for index, rank in chosen.items():
-        columns = [[_encode(_halves(first[index].path)[0], "photograph")]]
-        for name, views in folders.items():
-            photograph, render = _halves(views[index].path)
-            error = np.clip(np.abs(photograph - render).mean(-1) / ERROR_SCALE, 0.0, 1.0)
-            heat = matplotlib.colormaps["inferno"](error)[..., :3].astype(np.float32)
-            drawn = [_encode(render, f"{name}: {views[index].psnr:.2f} dB"), _encode(heat, f"error of {name}")]
-            columns += [drawn] if len(folders) > 1 else [[picture] for picture in drawn]
-        groups.append(Group(f"{title}{rank} of {len(ranked)}: number {index}", columns))
+        views = {os.path.relpath(folder, shared): folders[folder] for folder in sorted(members)}
+        first = folders[members[0]]
+        ranked = sorted(first, key=lambda index, views=views: sum(of[index].psnr for of in views.values()))
+        title = f"{', '.join(views)}: " if len(sets) > 1 else ""
+        chosen: dict[int, str] = {}
+        for rank, quantile in RANKS.items():
+            chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], rank)
+        for index, rank in chosen.items():
+            columns = [[_encode(_halves(first[index].path)[0], "photograph")]]
+            for name, of in views.items():
+                photograph, render = _halves(of[index].path)
+                error = np.clip(np.abs(photograph - render).mean(-1) / ERROR_SCALE, 0.0, 1.0)
+                heat = matplotlib.colormaps["inferno"](error)[..., :3].astype(np.float32)
+                drawn = [_encode(render, f"{name}: {of[index].psnr:.2f} dB"), _encode(heat, f"error of {name}")]
+                columns += [drawn] if len(views) > 1 else [[picture] for picture in drawn]
+            groups.append(Group(f"{title}{rank} of {len(ranked)}: number {index}", columns))
     return groups

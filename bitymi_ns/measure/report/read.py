@@ -23,9 +23,7 @@ from bitymi_ns.safe_reading import read_json, read_text, reading
 from bitymi_ns.trust import finite_numbers, json_of
 
 MAX_BYTES = 64 << 20  # larger files are not evaluations
-MAX_DEPTH = 8  # levels of folders that are searched
 ADVICE = "Write it again, or leave it out."
-_SKIPPED = {"__pycache__", "node_modules", "wandb", "nerfstudio_models"}
 
 
 def _refuse(message: str, cause: BaseException) -> NoReturn:
@@ -116,15 +114,12 @@ def _walk(folder: Path, skip: Path) -> Iterator[Path]:
     for root, folders, files in os.walk(folder):
         here = Path(root)
         if CELLS in files:
-            folders[:] = []
+            folders.clear()
             yield here / CELLS
             continue
-        deep = len(here.relative_to(folder).parts) >= MAX_DEPTH
-        kept = [name for name in folders if not (name.startswith(".") or name in _SKIPPED or here / name == skip)]
-        folders[:] = [] if deep else sorted(kept)
+        folders[:] = sorted(name for name in folders if not name.startswith(".") and here / name != skip)
         for file in map(here.joinpath, sorted(files)):
-            kind = file.suffix.lower()
-            if kind in (".json", ".jsonl") or (kind == ".png" and SIDE_BY_SIDE.match(file.stem)):
+            if file.suffix.lower() in (".json", ".jsonl") or SIDE_BY_SIDE.match(file.name):
                 yield file
 
 

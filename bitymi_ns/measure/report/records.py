@@ -1,5 +1,6 @@
 """Records of a report and the links between them: evaluations, training curves."""
 
+import os
 import statistics
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -131,20 +132,11 @@ def trained_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation
     return same[0] if row.baked and len(same) == 1 else None
 
 
-def _suffixes(sources: list[Path]) -> list[str]:
-    """Return the last component of each path in which all paths differ."""
-    parts = [[*path.resolve().parts[:-1], path.stem] for path in sources]
-    for depth in range(1, max(map(len, parts)) + 1):
-        pieces = [p[-depth] if len(p) >= depth else "" for p in parts]
-        if len(set(pieces)) == len(pieces):
-            return pieces
-    return [str(i + 1) for i in range(len(sources))]
-
-
 def disambiguate(items: list) -> None:
-    """Make the labels of evaluations (within a scene and stage) or curves (within a scene) unique, in place."""
+    """Add their files to equal labels of evaluations (of a scene and stage) or curves (of a scene), in place."""
     same = grouped(range(len(items)), lambda i: (items[i].scene, getattr(items[i], "baked", None), items[i].label))
     for indices in same.values():
-        if len(indices) > 1:
-            for i, suffix in zip(indices, _suffixes([items[i].source for i in indices]), strict=True):
-                items[i] = replace(items[i], label=f"{items[i].label} ({suffix})")
+        shared = os.path.commonpath([items[i].source.resolve().parent for i in indices])
+        for i in indices if len(indices) > 1 else ():
+            file = os.path.relpath(items[i].source.resolve().with_suffix(""), shared)
+            items[i] = replace(items[i], label=f"{items[i].label} ({file})")

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from bitymi_ns import ops
 from bitymi_ns.measure.stability.scenes import (
     ALPHAS,
     PLAIN,
+    RIM,
     SV_KEYS,
     TEXELS,
     SceneCase,
@@ -37,8 +39,11 @@ class Backend:
     use: Callable[[], AbstractContextManager[object]] = nullcontext  # context that selects it in `bitymi_ns.ops`
 
 
-_ALL = (Backend("cpu", "cpu"), Backend("cuda", "cuda"), Backend("emulated", "cpu", emulated_cuda))
-BACKENDS = {backend.name: backend for backend in _ALL}
+BACKENDS = {
+    "cpu": Backend("cpu", "cpu"),
+    "cuda": Backend("cuda", "cuda"),
+    "emulated": Backend("emulated", "cpu", emulated_cuda),
+}
 """Backends by name; tests/stress runs every case on the available ones. `emulated`: CUDA kernels run on the host."""
 
 
@@ -64,8 +69,7 @@ NOTHING = 1e-15
 PROBES = 3  # random perturbations of the inputs for `Errors.input_*`
 
 
-@dataclass(frozen=True)
-class Errors:
+class Errors(NamedTuple):
     """Errors of one case, each the maximum over all elements, relative to the largest value of the image or gradient.
 
     A pixel is compared only if both renderers blend the same surfels there, in the same branch of the kernel, and fetch
@@ -75,30 +79,33 @@ class Errors:
     """
 
     forward: float  # largest error of rgb, alpha, depth, normal and Beta map
-    gradient: float  # largest error of the gradients of a random linear loss of these images
-    worst: str  # parameter with that error
-    flipped: float  # share of flipped pixels
     input_forward: float
     """Change of the reference's images if each input is perturbed by up to half a unit in its last place."""
-    input_gradient: float  # the same for its gradients
+    gradient: float  # largest error of the gradients of a random linear loss of these images
+    input_gradient: float  # their change as in `input_forward`
+    worst: str  # parameter with the largest error of its gradient
+    flipped: float  # share of flipped pixels
     drawn: int  # blended fragments of the reference
     finite: bool  # True if all images and gradients of the backend are finite, over all pixels
 
+    @property
+    def pairs(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Errors of images and of gradients, each with what rounded inputs cause."""
+        return (self.forward, self.input_forward), (self.gradient, self.input_gradient)
 
-@dataclass
-class _Result:
+
+class _Result(NamedTuple):
     images: dict[str, Tensor]  # [P, C] each, with autograd graph
     blended: Tensor  # [P, N] bool
     low_pass: Tensor  # [P, N] bool
+    cells: Tensor  # [P, N] int64; 0 without texels
     leaves: dict[str, Tensor]
-    cells: Tensor | None = None  # [P, N] int64, of textured surfels
 
-    def same(self, other: "_Result") -> Tensor:
-        """Find the pixels, [P] bool, in which both sum the same terms."""
-        alike = self.low_pass == other.low_pass
-        if self.cells is not None and other.cells is not None:
-            alike &= (self.cells == other.cells) & (self.cells >= 0)
-        return ((self.blended == other.blended) & (alike | ~other.blended)).all(1)
+
+def _same(got: _Result, want: _Result) -> Tensor:
+    """Find the pixels, [P] bool, in which both sum the same terms."""
+    alike = (got.low_pass == want.low_pass) & (got.cells == want.cells) & (got.cells >= 0)
+    return ((got.blended == want.blended) & (alike | ~want.blended)).all(1)
 
 
 def measure(
@@ -115,7 +122,7 @@ def measure(
     with backend.use():
         got = _by_kernels(rounded, backend.device, dtype, near, way)
         want = _by_reference(rounded, near, way)
-        same = got.same(want)
+        same = _same(got, want)
         weights = _loss_weights(want.images)
         grads = _gradients(got, weights, same)
         everywhere = _gradients(got, weights, torch.ones_like(same))
@@ -127,17 +134,17 @@ def measure(
     for _ in range(PROBES):
         moved = _map(rounded, lambda t: t * (1 + ROUNDING[dtype] * _signs(t, generator)))
         other = _by_reference(moved, near, way)
-        agree = other.same(want)
+        agree = _same(other, want)
         input_forward = max(input_forward, _image_error(other.images, want.images, agree))
         here, there = (_gradients(result, weights, agree & same) for result in (want, other))
         input_gradient = max(input_gradient, *(_relative(there[key], here[key]) for key in here))
     return Errors(
         forward=_image_error(got.images, want.images, same),
+        input_forward=input_forward,
         gradient=gradient_errors[worst],
+        input_gradient=input_gradient,
         worst=worst,
         flipped=1.0 - same.double().mean().item(),
-        input_forward=input_forward,
-        input_gradient=input_gradient,
         drawn=int(want.blended.sum()),
         finite=all(bool(t.isfinite().all()) for t in (*got.images.values(), *grads.values(), *everywhere.values())),
     )
@@ -157,7 +164,7 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
     alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0) if way.alpha else None
     projection = ops.project(*geometry_of(leaves), camera=camera, near=near, alpha=alpha)
-    fragments = ops.trace(projection, way.rim)
+    fragments = ops.trace(projection, RIM)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
     textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
     image = ops.blended_image(fragments, projection, base, **textured, maps=True)
@@ -166,12 +173,11 @@ def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, w
     pixel, surfel = fragments.pixel.cpu().long(), fragments.surfel.cpu().long()
     blended[pixel, surfel] = True
     low_pass[pixel, surfel] = fragments.sigma.cpu() < 0
-    between = None
+    between = torch.zeros(shape, dtype=torch.int64)
     if way.texels:
-        between = torch.zeros(shape, dtype=torch.int64)
         between[pixel, surfel] = cells(fragments.uv.T).cpu()
     parts = dict(zip(SIZES, image.split(list(SIZES.values()), dim=1), strict=True))
-    return _Result({key: parts[key] for key in IMAGES}, blended, low_pass, leaves, between)
+    return _Result({key: parts[key] for key in IMAGES}, blended, low_pass, between, leaves)
 
 
 def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
@@ -181,10 +187,11 @@ def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
     geometry = geometry_of(leaves)
     texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]
     tiles = tile_images(torch.cat(texels, 1)) if texels else None
-    result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=way.rim)
+    result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=RIM)
     images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
     trace = result.trace
-    return _Result(images, trace.blended, trace.low_pass, leaves, cells(trace.uv) if way.texels else None)
+    between = cells(trace.uv) if way.texels else torch.zeros_like(trace.blended, dtype=torch.int64)
+    return _Result(images, trace.blended, trace.low_pass, between, leaves)
 
 
 def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:

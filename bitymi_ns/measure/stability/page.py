@@ -1,9 +1,9 @@
 """The page docs/stability.md: errors of float32 in each case and along each kind of stiffness."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,24 +21,12 @@ ALLOWANCE = 4.0  # an error of at most this many times the effect of rounding th
 LIMITED, NOTHING = "as the inputs allow", "nothing drawn"  # verdicts
 
 
-@dataclass(frozen=True)
-class SceneErrors:
+class SceneErrors(NamedTuple):
     """Errors measured on one scene."""
 
     label: str
     single: Errors  # of the kernels in float32
     double: Errors  # of the kernels in float64
-
-    @property
-    def exact(self) -> float:
-        """Largest error of images and gradients of the kernels in float64."""
-        return max(self.double.forward, self.double.gradient)
-
-    @property
-    def errors(self) -> tuple[float, float, float, float]:
-        """Errors of the images, their errors from rounded inputs, and the same of the gradients."""
-        e = self.single
-        return e.forward, e.input_forward, e.gradient, e.input_gradient
 
     @property
     def verdict(self) -> str:
@@ -48,7 +36,7 @@ class SceneErrors:
             return "**not finite**"
         if self.single.drawn == 0:
             return NOTHING
-        pairs = [pair for e in both for pair in ((e.forward, e.input_forward), (e.gradient, e.input_gradient))]
+        pairs = [pair for e in both for pair in e.pairs]
         if all(error <= ACCURATE for error, _ in pairs):
             return "accurate"
         if all(error <= max(ACCURATE, ALLOWANCE * allowed) for error, allowed in pairs):
@@ -67,19 +55,20 @@ def write(path: Path, backend: Backend, progress: Callable[[str], None]) -> list
     picture = path.with_suffix(".png") if path.name else path
     for target in (path, picture):
         check_writable(target)
-    named: dict[str, list[SceneErrors]] = {}
+    groups: dict[str, list[SceneErrors]] = {}
     for way in (PLAIN, *WAYS):
         progress(f"cases, {way.name}")
-        named[way.name] = [
+        groups[way.name] = [
             measure_row(scene.name.replace("_", " "), scene, backend, way=way) for scene in extreme_scenes()
         ]
-    swept: dict[str, list[SceneErrors]] = {}
     for sweep in SWEEPS:
         progress(f"sweep {sweep.name}")
-        swept[sweep.name] = [
-            measure_row(f"{value:g}", sweep.make(value), backend, sweep.near(value)) for value in sweep.values
+        groups[sweep.name] = [
+            measure_row(f"{sweep.name}, {value:g}", sweep.make(value), backend, sweep.near(value))
+            for value in sweep.values
         ]
-    rows = [row for rows in (*named.values(), *swept.values()) for row in rows]
+    rows = [row for group in groups.values() for row in group]
+    swept = [row for sweep in SWEEPS for row in groups[sweep.name]]
     counts = {"accurate": 0, LIMITED: 0, "loses figures": 0, **Counter(row.verdict.strip("*") for row in rows)}
     text = rendered(
         "stability.md.j2",
@@ -90,46 +79,34 @@ def write(path: Path, backend: Backend, progress: Callable[[str], None]) -> list
         steps=round(1 / (255 * ACCURATE)),
         allowance=f"{ALLOWANCE:g}",
         picture=picture.name,
-        sweeps=_sweeps(swept),
-        cases={name: _inexact([row for row in of_way if row.verdict != NOTHING]) for name, of_way in named.items()},
+        cases={name: _inexact(group) for name, group in (*groups.items(), ("sweeps", swept))},
         verdicts=", ".join(f"{count} {verdict}" for verdict, count in counts.items() if verdict != NOTHING),
-        nothing=", ".join(row.label for row in named[PLAIN.name] if row.verdict == NOTHING),
+        nothing=", ".join(row.label for row in groups[PLAIN.name] if row.verdict == NOTHING),
     )
-    write_file(picture, _plot(swept), follow=True)
+    write_file(picture, _plot(groups), follow=True)
     write_file(path, text.encode(), follow=True)
     return rows
 
 
 CASES = ("case", "forward", "inputs", "gradient", "inputs", "worst in", "flipped", "float64", "verdict")
-SWEPT = ("kind", "values", "forward", "inputs", "gradient", "inputs", "float64", "not accurate at")
 
 
 def _inexact(rows: Sequence[SceneErrors]) -> str:
     """Summarise the accurate cases with their largest errors, then format a line for each other case."""
-    accurate = [row for row in rows if row.verdict == "accurate"]
-    images, gradients = (_short(max((row.errors[i] for row in accurate), default=0.0)) for i in (0, 2))
+    rows = [row for row in rows if row.verdict != NOTHING]
+    accurate = [row.single for row in rows if row.verdict == "accurate"]
+    images = _short(max((e.forward for e in accurate), default=0.0))
+    gradients = _short(max((e.gradient for e in accurate), default=0.0))
     text = f"{len(accurate)} of {len(rows)} cases are accurate: images within {images}, gradients within {gradients}."
     lines = []
     for row in rows:
         if row.verdict != "accurate":
-            worst = row.single.worst if row.single.gradient else ""
-            flipped = f"{100 * row.single.flipped:.2g} %"
-            lines.append([row.label, *map(_short, row.errors), worst, flipped, _short(row.exact), row.verdict])
+            e, exact = row.single, max(row.double.forward, row.double.gradient)
+            cells = [_short(error) for pair in e.pairs for error in pair]
+            cells += [e.worst, f"{100 * e.flipped:.2g} %", _short(exact), row.verdict]
+            lines.append([row.label, *cells])
     table = markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
     return f"{text} The others:\n\n{table}" if lines else text
-
-
-def _sweeps(swept: Mapping[str, Sequence[SceneErrors]]) -> str:
-    """Format a line for each sweep: the largest errors, and the values whose verdict is not "accurate"."""
-    lines = []
-    for sweep in SWEEPS:
-        rows = swept[sweep.name]
-        errors = map(max, zip(*((*row.errors, row.exact) for row in rows), strict=True))
-        labels = {LIMITED: "{0.label}", "accurate": ""}
-        inexact = filter(None, (labels.get(row.verdict, "{0.label} ({0.verdict})").format(row) for row in rows))
-        values = f"{rows[0].label} to {rows[-1].label}"
-        lines.append([sweep.axis, values, *map(_short, errors), ", ".join(inexact) or "-"])
-    return markdown.table(SWEPT, lines, (0, 1, len(SWEPT) - 1))
 
 
 def _short(value: float) -> str:
@@ -146,12 +123,12 @@ LOWEST = 1e-17
 
 
 @styled
-def _plot(swept: dict[str, list[SceneErrors]]) -> bytes:
+def _plot(groups: dict[str, list[SceneErrors]]) -> bytes:
     """Draw the errors of each sweep over its values, stiffer to the right."""
     figure, axes = panels([sweep.name for sweep in SWEEPS], "", "error", most=4)
     for panel, sweep in zip(axes, SWEEPS, strict=True):
-        rows = swept[sweep.name]
-        columns = zip(*((*row.errors, row.double.forward, row.double.gradient) for row in rows), strict=True)
+        rows = groups[sweep.name]
+        columns = zip(*((*row.single[:4], row.double.forward, row.double.gradient) for row in rows), strict=True)
         for (label, color, style), values in zip(LINES, columns, strict=True):
             panel.plot(sweep.values, np.maximum(values, LOWEST), style, color=color, ms=4, lw=1.3, label=label)
         panel.set(xlabel=sweep.axis, xscale="log", yscale="log", ylim=(LOWEST / 2, 30))

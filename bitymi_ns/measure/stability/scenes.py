@@ -239,7 +239,6 @@ class Way:
     name: str  # short, for tables and tests
     texels: bool = False  # each surfel has a tile of random texels; gradients reach them and, by the fetch, u and v
     alpha: bool = False  # the texels have random alphas from 0 to 2, without a weight bound
-    rim: float = RIM  # as in `ops.trace`
 
     def of(self, case: SceneCase) -> SceneCase:
         """Add random texels to a case if this mode has texels."""

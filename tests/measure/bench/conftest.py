@@ -12,7 +12,7 @@ import pytest
 from bitymi_ns.bundle import World
 from bitymi_ns.bundle.manifest import describe, dump
 from bitymi_ns.codec.quantise import Format
-from bitymi_ns.measure.bench.matrix import BundleSpec, Chain, MethodSpec, SceneSpec, chains
+from bitymi_ns.measure.bench.matrix import Chain, Row, Scene, chains
 
 FAKE = """#!{python} -SE
 import json, os, pathlib, sys, time
@@ -138,6 +138,5 @@ def capture(tmp_path: Path) -> Callable[[str], Path]:
 @pytest.fixture
 def matrix(capture: Callable[[str], Path]) -> list[Chain]:
     """Two captures, two seeds, one format: 16 cells."""
-    scenes = [SceneSpec(name, capture(name)) for name in ("fox", "lego")]
-    bundles = [BundleSpec("bc7", ("--format", "bc7"))]
-    return chains(scenes, [MethodSpec("bitymi", "bitymi")], (0, 1), 100, bundles)
+    scenes = [Scene(name, str(capture(name))) for name in ("fox", "lego")]
+    return chains(scenes, {"bitymi": Row(method="bitymi")}, {"bc7": ("--format", "bc7")}, (0, 1), 100)

@@ -14,7 +14,7 @@ from bitymi_ns.locks import Lock
 from bitymi_ns.measure.bench import engine
 from bitymi_ns.measure.bench.cells import Cells, identity
 from bitymi_ns.measure.bench.engine import run_chains
-from bitymi_ns.measure.bench.matrix import BundleSpec, Chain, MethodSpec, chains
+from bitymi_ns.measure.bench.matrix import Chain, Row, Scene, chains
 from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, tool
 
 
@@ -53,7 +53,7 @@ def test_commands_are_the_stock_ones_with_all_settings(fakes, matrix: list[Chain
 def test_finished_cells_are_skipped(fakes, matrix: list[Chain], tmp_path: Path) -> None:
     run_chains(tmp_path / "work", matrix)
     fakes.calls()
-    renamed = [[replace(cell, row=MethodSpec("another name", "bitymi")) for cell in chain] for chain in matrix]
+    renamed = [[replace(cell, row="another name") for cell in chain] for chain in matrix]
     assert run_chains(tmp_path / "work", matrix) == run_chains(tmp_path / "work", renamed) == []
     assert fakes.calls() == []
 
@@ -88,7 +88,7 @@ def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
     fakes, matrix: list[Chain], capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     work, python = tmp_path / "work", fakes.python(monkeypatch)
-    words = [python, "-m", "bitymi_ns", "bench", "local", "--data", str(matrix[0][0].scene.data), "--steps", "10"]
+    words = [python, "-m", "bitymi_ns", "bench", "local", "--data", matrix[0][0].data, "--steps", "10"]
     words += ["--formats", "bc7", "--work", str(work)]
     fakes.slow.write_text("ns-export")
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
@@ -156,7 +156,8 @@ def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: list[Chain], 
 
 
 def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: list[Chain], tmp_path: Path) -> None:
-    other = chains([matrix[0][0].scene], [MethodSpec("splatfacto", "splatfacto")], (), 100, [BundleSpec("bc7", ())])
+    scene = Scene("fox", matrix[0][0].data)
+    other = chains([scene], {"splatfacto": Row(method="splatfacto")}, {"bc7": ()}, (), 100)
     assert run_chains(tmp_path / "work", other) == []
     assert [call.split()[0] for call in fakes.calls()] == ["ns-train", "ns-eval"]
     (cell, _) = lines(tmp_path / "work")
@@ -199,7 +200,7 @@ def test_places_that_cannot_be_written_are_found_first(
         "bench",
         "local",
         "--data",
-        str(matrix[0][0].scene.data),
+        matrix[0][0].data,
         "--steps",
         "10",
         "--work",

@@ -38,7 +38,7 @@ def test_mipnerf360_is_read_by_the_colmap_parser(tmp_path: Path) -> None:
 
 def test_other_suites(tmp_path: Path) -> None:
     train, truck = standard_scenes("tanksandtemples", make_suite(tmp_path / "a", "tanksandtemples"))
-    assert "--downscale-factor 1" in " ".join(train.parser) and truck.name == "truck"
+    assert "--downscale-factor 1" in " ".join(train.parser) and truck.scene == "truck"
     scenes = standard_scenes("nerf-synthetic", make_suite(tmp_path / "b", "nerf-synthetic"))
     assert len(scenes) == 8 and scenes[0].parser == ("blender-data",)
 
@@ -69,20 +69,20 @@ def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["ablation", "overdraw", "resolution"])
 def test_plans_name_methods_that_there_are(name: str) -> None:
-    rows, bundles = read_plan(name)
-    assert {row.method for row in rows} <= set(preset_names()) and len({row.name for row in rows}) == len(rows) > 2
-    assert bundles is not None and len(bundles) == (name == "overdraw")
-    assert len(read_plan("rate")[1] or ()) == 4
-    rows, bundles = read_plan("atlas")
-    assert len(rows) == 1 and bundles is not None and [b.name for b in bundles][:2] == ["paper-rule", "local-voxel"]
-    assert all("--format bc7" in " ".join(b.options) for b in bundles)
+    plan = read_plan(name)
+    assert {row.method for row in plan.rows.values()} <= set(preset_names()) and len(plan.rows) > 2
+    assert plan.bundles is not None and len(plan.bundles) == (name == "overdraw")
+    assert len(read_plan("rate").bundles or ()) == 4
+    atlas = read_plan("atlas")
+    assert len(atlas.rows) == 1 and list(atlas.bundles or ())[:2] == ["paper-rule", "local-voxel"]
+    assert all("--format bc7" in " ".join(options) for options in (atlas.bundles or {}).values())
 
 
 def test_a_plan_of_ones_own(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     path.write_text('rows: {a: {method: bitymi, options: [--x, 0.5]}}\nbundles: {small: [--r-max, "16"]}\n')
-    (row,), (bundle,) = read_plan(str(path))
-    assert row.options == ("--x", "0.5") and bundle.options == ("--r-max", "16")
+    plan = read_plan(str(path))
+    assert plan.rows["a"].options == ["--x", "0.5"] and plan.bundles == {"small": ["--r-max", "16"]}
     with pytest.raises(BenchError, match="there is no plan x: give ablation"):
         read_plan("x")
 

@@ -7,7 +7,7 @@ import pytest
 
 from bitymi_ns import cli
 from bitymi_ns.measure.stability import page
-from bitymi_ns.measure.stability.errors import BACKENDS, Errors
+from bitymi_ns.measure.stability.errors import BACKENDS
 from bitymi_ns.measure.stability.scenes import random_scene
 
 
@@ -31,13 +31,12 @@ def test_the_page_and_its_plot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
 
 def test_verdicts() -> None:
     row = page.measure_row("easy", random_scene(3, 0, 8, 8), BACKENDS["cpu"])
-    assert row.verdict == "accurate" and row.exact < 1e-10
+    assert row.verdict == "accurate" and max(row.double.forward, row.double.gradient) < 1e-10
 
     def verdict(**changes: float) -> str:
-        return dataclasses.replace(row, single=dataclasses.replace(row.single, **changes)).verdict
+        return row._replace(single=row.single._replace(**changes)).verdict
 
     assert verdict(finite=False) == "**not finite**"
     assert verdict(drawn=0) == "nothing drawn"
     assert verdict(gradient=1e-3, input_gradient=5e-4) == "as the inputs allow"
     assert verdict(gradient=1e-3, input_gradient=1e-5) == "**loses figures**"
-    assert isinstance(row.single, Errors)

@@ -29,13 +29,6 @@ struct Device {
   void (*prepare)(void* at, size_t bytes) = nullptr;  // prepares memory that will be written, or null
 };
 
-// References to the arrays and objects that a Python object points to.
-struct References {
-  std::vector<nb::ndarray<nb::ro>> read;
-  std::vector<nb::ndarray<>> written;
-  std::vector<nb::object> objects;
-};
-
 // Reads torch tensors without DLPack, whose capsule costs about 10 us of Python per tensor.
 class Torch {
  public:
@@ -109,7 +102,7 @@ inline namespace of_cuda {
 #endif
 // Arguments that are a Python object, with what they point to.
 template <class Arguments> struct Held : Arguments {
-  References kept;
+  std::vector<nb::object> kept;
 };
 }
 
@@ -117,7 +110,7 @@ class Reader {
  public:
   Reader(std::string function, const nb::kwargs& kwargs, const Device& device)
       : function_(std::move(function)), device_(device) {
-    arguments_.reserve(kwargs.size()), kept_.objects.reserve(kwargs.size());
+    arguments_.reserve(kwargs.size()), kept_.reserve(kwargs.size());
     PyObject *key, *value;
     for (Py_ssize_t at = 0; PyDict_Next(kwargs.ptr(), &at, &key, &value);)
       arguments_.push_back({PyUnicode_AsUTF8(key), value, false});
@@ -192,7 +185,7 @@ class Reader {
     std::conditional_t<IsDescribed<Plain>::value, Held<Plain>, Plain>* held = nullptr;
     const nb::handle found = find(name);
     if (!nb::try_cast(found, held) || !held) wrong(name, "an object of this module");
-    kept_.objects.push_back(nb::borrow(found));
+    kept_.push_back(nb::borrow(found));
     to = held;
   }
   template <class T> void maybe_object(const char* name, T*& to) {
@@ -207,7 +200,7 @@ class Reader {
       if (!g.taken && g.value != Py_None)
         throw nb::type_error((function_ + " takes no argument '" + g.name + "'").c_str());
   }
-  References keep() { return std::move(kept_); }
+  std::vector<nb::object> keep() { return std::move(kept_); }
 
  private:
   template <class F, class T, class... More> static void each(const F& fn, const char* name, T& to, More&... more) {
@@ -248,10 +241,10 @@ class Reader {
     void* at;
     if (const Torch* torch = Torch::get(); torch && torch->is_tensor(object)) {
       if (!torch->read(object, kDtype, device_.type, at, size)) not_an_array(name, kDtype);
-      kept_.objects.push_back(nb::borrow(object));
     } else {
       at = take_other<T>(name, object, size);
     }
+    kept_.push_back(nb::borrow(object));
     if (reinterpret_cast<uintptr_t>(at) % alignment)
       refuse(std::string(name) + " must start at a multiple of " + std::to_string(alignment) + " bytes");
     if constexpr (!std::is_const_v<T>)
@@ -265,12 +258,7 @@ class Reader {
     if (!nb::try_cast(object, a, false) || a.device_type() != device_.type || a.dtype() != kDtype || !dense(a))
       not_an_array(name, kDtype);
     size = int64_t(a.size());
-    void* at = const_cast<void*>(static_cast<const void*>(a.data()));
-    if constexpr (std::is_const_v<T>)
-      kept_.read.push_back(std::move(a));
-    else
-      kept_.written.push_back(std::move(a));
-    return at;
+    return const_cast<void*>(static_cast<const void*>(a.data()));
   }
   template <class A> static bool dense(const A& a) {
     int64_t step = 1;
@@ -284,7 +272,7 @@ class Reader {
   const std::string function_;  // a copy: callers also pass literals
   Device device_;
   std::vector<Argument> arguments_;  // the call keeps the objects alive
-  References kept_;
+  std::vector<nb::object> kept_;
 };
 
 inline void Reader::wrong(const char* name, const std::string& wanted) const {

@@ -62,11 +62,7 @@ template <class S> using Order = std::pair<S, int32_t>;  // depth, surfel
 template <class Kernel, class S> class Extents {
  public:
   Extents(const View<S>& view, const Order<S>* order, int64_t begin, int64_t end, float* level)
-      : geom_(view.geom),
-        radii_(view.radii),
-        near_(view.near),
-        width_(view.width),
-        height_(view.height),
+      : view_(view),
         sharp_(double(Resize<S>(view.photo_pixel).sharp)),
         order_(order),
         next_(begin),
@@ -83,16 +79,16 @@ template <class Kernel, class S> class Extents {
   void load(int64_t k) {
     first_ = k, next_ = std::min(k + kLanes, end_);
     for (int64_t after = next_; after < std::min(next_ + kLanes, end_); ++after) {
-      __builtin_prefetch(geom_ + int64_t(order_[after].second) * kGeom);
-      __builtin_prefetch(radii_ + 2 * int64_t(order_[after].second));
+      __builtin_prefetch(view_.geom + int64_t(order_[after].second) * kGeom);
+      __builtin_prefetch(view_.radii + 2 * int64_t(order_[after].second));
     }
     if constexpr (std::is_same_v<S, float>)
       load_lanes();
     else
       for (int lane = 0; lane < next_ - first_; ++lane) {
         const S* g = row(lane);
-        found_[lane] = extent<Kernel>(g, width_, height_, sharp_);
-        store_levels(lane, reach_levels<Kernel>(g, near_, sharp_));
+        found_[lane] = extent<Kernel>(g, view_.width, view_.height, sharp_);
+        store_levels(lane, reach_levels<Kernel>(g, view_.near, sharp_));
       }
   }
   void load_lanes() {
@@ -103,9 +99,9 @@ template <class Kernel, class S> class Extents {
     }
     P g[kGeom];
     for (int c = 0; c < kGeom; ++c) g[c] = bt::load(columns[c]);
-    auto [level, e] = level_extent<Kernel>(g, width_, height_, sharp_, kFloatRoom);
+    auto [level, e] = level_extent<Kernel>(g, view_.width, view_.height, sharp_, kFloatRoom);
     find_outermost(e);
-    const P blur = select(covers_low_pass(g, P(near_), P(1 / sharp_)), P(0.0f), level.blur);
+    const P blur = select(covers_low_pass(g, P(view_.near), P(1 / sharp_)), P(0.0f), level.blur);
     const uint32_t whole = bits(e.whole), ellipse = bits(e.ellipse), thin = bits(e.thin);
     for (int lane = 0; lane < next_ - first_; ++lane) {
       Extent& to = found_[lane];
@@ -115,14 +111,15 @@ template <class Kernel, class S> class Extents {
       store_levels(lane, {level.r2[lane], blur[lane] * blur[lane]});
     }
   }
-  const S* row(int lane) const { return geom_ + int64_t(order_[std::min(first_ + lane, end_ - 1)].second) * kGeom; }
+  const S* row(int lane) const {
+    return view_.geom + int64_t(order_[std::min(first_ + lane, end_ - 1)].second) * kGeom;
+  }
   void store_levels(int lane, ReachLevels levels) {
     float* to = level_ + 2 * int64_t(order_[first_ + lane].second);
     to[0] = levels.r2, to[1] = levels.blur2;
   }
 
-  const S *geom_, *radii_, near_;
-  int width_, height_;
+  const View<S>& view_;
   double sharp_;
   const Order<S>* order_;
   int64_t first_ = 0, next_, end_;

@@ -194,22 +194,15 @@ __global__ void __launch_bounds__(kThreads)
 }
 }  // namespace
 
-template <class S> int64_t bin_count_workspace(int64_t n) {
-  Arena arena(nullptr);
-  const CountSpace<S> w(arena, n);
-  return arena.used();
-}
+template <class S> int64_t bin_count_workspace(int64_t n) { return space_bytes<CountSpace<S>>(n); }
 int64_t bin_fill_workspace(int64_t pairs, int width, int height) {
-  Arena arena(nullptr);
-  const FillSpace w(arena, pairs, tiles_of(width, height));
-  return arena.used();
+  return space_bytes<FillSpace>(pairs, tiles_of(width, height));
 }
 
 template <class S> void bin_count(const BinCount<S>& a, Stream stream) {
   const View<S>& v = a.view;
   const int64_t n = v.n;
-  Arena arena(a.workspace.of(bin_count_workspace<S>(n)));
-  const CountSpace<S> w(arena, n);
+  const CountSpace<S> w = cut_space<CountSpace<S>>(a.workspace, n);
   BT_LAUNCH_EACH(count_kernel<S>, n, kThreads, stream, v, w);
   sort_pairs(w.keys, w.sorted, w.rows, a.order, n, CountSpace<S>::kBits, w.temp, w.temp_size, stream);
   BT_LAUNCH_EACH(rank_kernel, n + 1, kThreads, stream, n, a.order, w.counts, w.ranked);
@@ -219,8 +212,7 @@ template <class S> void bin_count(const BinCount<S>& a, Stream stream) {
 template <class S> void bin_fill(const BinFill<S>& a, Stream stream) {
   const View<S>& v = a.view;
   const int64_t pairs = a.pairs, tiles = tiles_of(v.width, v.height);
-  Arena arena(a.workspace.of(bin_fill_workspace(pairs, v.width, v.height)));
-  const FillSpace w(arena, pairs, tiles);
+  const FillSpace w = cut_space<FillSpace>(a.workspace, pairs, tiles);
   if (pairs) {
     BT_LAUNCH_EACH(list_kernel<S>, v.n, kThreads, stream, v, a.order, a.slot_start, w);
     sort_pairs(w.tile, w.sorted, w.slots, a.slot, pairs, tile_bits(tiles), w.temp, w.temp_size, stream);

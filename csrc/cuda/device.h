@@ -5,7 +5,7 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "core/common.h"
+#include "ops/arguments.h"
 
 #if defined(__CUDACC__)
 
@@ -116,5 +116,15 @@ class Arena {
   uintptr_t base_;
   int64_t used_ = 0;
 };
+// Bytes of working memory described by Space, a class that an arena and these arguments make; and one cut from it.
+template <class Space, class... A> int64_t space_bytes(const A&... a) {
+  Arena arena(nullptr);
+  Space(arena, a...);
+  return arena.used();
+}
+template <class Space, class... A> Space cut_space(const Workspace& from, const A&... a) {
+  Arena arena(from.of(space_bytes<Space>(a...)));
+  return Space(arena, a...);
+}
 
 }  // namespace bt::cuda

@@ -14,6 +14,22 @@ constexpr int kWide = 32, kRows = 4;  // a tile is 32 columns; a thread takes 4 
 template <class S> constexpr int kThreads = sizeof(S) == 4 ? 128 : 64;  // as 48 KB of shared memory allow
 template <class S> constexpr int kHigh = kThreads<S> / kWide * kRows;
 
+// Filters N numbers along the columns, for the rows from y on; the window is symmetric.
+template <int N, class S>
+__device__ __forceinline__ void filter_columns(const SsimWindow<S>& window, const S (&row)[N][kHigh<S> + kRim][kWide],
+                                               int x, int y, S (&m)[N][kRows]) {
+  BT_UNROLL
+  for (int j = 0; j < N; ++j) {
+    BT_UNROLL
+    for (int t = 0; t < kTaps + kRows - 1; ++t) {
+      const S value = row[j][y + t][x];
+      BT_UNROLL
+      for (int i = 0; i < kRows; ++i)
+        if (t >= i && t - i < kTaps) m[j][i] += window.k[t - i] * value;
+    }
+  }
+}
+
 template <class S> struct Moments {
   S image[2][kHigh<S> + kRim][kWide + kRim];
   S row[5][kHigh<S> + kRim][kWide];
@@ -48,16 +64,7 @@ __global__ void __launch_bounds__(kThreads<S>)
   __syncthreads();
   const int x = thread % kWide, y = thread / kWide * kRows;
   S m[5][kRows] = {};
-  BT_UNROLL
-  for (int j = 0; j < 5; ++j) {
-    BT_UNROLL
-    for (int t = 0; t < kTaps + kRows - 1; ++t) {
-      const S value = s.row[j][y + t][x];
-      BT_UNROLL
-      for (int i = 0; i < kRows; ++i)
-        if (t >= i && t - i < kTaps) m[j][i] += window.k[t - i] * value;
-    }
-  }
+  filter_columns(window, s.row, x, y, m);
   const S share = S(1) / (S(rows) * S(columns) * S(channels));
   double own = 0;
   BT_UNROLL
@@ -119,16 +126,7 @@ __global__ void __launch_bounds__(kThreads<S>)
   __syncthreads();
   const int x = thread % kWide, y = thread / kWide * kRows;
   S m[3][kRows] = {};
-  BT_UNROLL
-  for (int part = 0; part < 3; ++part) {
-    BT_UNROLL
-    for (int t = 0; t < kTaps + kRows - 1; ++t) {
-      const S value = s.row[part][y + t][x];
-      BT_UNROLL
-      for (int i = 0; i < kRows; ++i)
-        if (t >= i && t - i < kTaps) m[part][i] += window.k[kRim - (t - i)] * value;
-    }
-  }
+  filter_columns(window, s.row, x, y, m);
   BT_UNROLL
   for (int i = 0; i < kRows; ++i) {
     if (x0 + x >= width || y0 + y + i >= height) continue;
@@ -136,43 +134,37 @@ __global__ void __launch_bounds__(kThreads<S>)
     da[at] = ssim_pixel_gradient(a[at], b[at], m[0][i], m[1][i], m[2][i]);
   }
 }
-}  // namespace
 
-namespace {
 // Tiles and working memory of a call.
 template <class S> struct Plan {
   int64_t rows, columns;  // of windows
   dim3 windows, pixels;   // blocks
   double* sums;           // [blocks of windows]
   S* parts;               // [channels, 3, rows, columns], with a gradient
-  int64_t bytes;
 
-  Plan(int height, int width, int channels, bool gradient, void* workspace)
+  Plan(Arena& arena, int height, int width, int channels, bool gradient)
       : rows(height - kRim), columns(width - kRim), windows(0, 0, 0) {
     const auto blocks = [channels](int64_t wide, int64_t high) {
       return dim3(unsigned(ceil_div(wide, kWide)), unsigned(ceil_div(high, kHigh<S>)), unsigned(channels));
     };
     if (rows > 0 && columns > 0) windows = blocks(columns, rows);
     pixels = blocks(width, height);
-    Arena arena(workspace);
     sums = arena.take<double>(count());
     parts = arena.take<S>(gradient && count() ? 3 * rows * columns * channels : 0);
-    bytes = arena.used();
   }
   int64_t count() const { return int64_t(windows.x) * windows.y * windows.z; }
 };
 }  // namespace
 
 template <class S> int64_t ssim_workspace(int height, int width, int channels, bool gradient) {
-  return Plan<S>(height, width, channels, gradient, nullptr).bytes;
+  return space_bytes<Plan<S>>(height, width, channels, gradient);
 }
 
 template <class S> void ssim(const Ssim<S>& images, Stream stream) {
   const int height = images.height, width = images.width, channels = images.channels;
   const S *a = images.a, *b = images.b;
   S* da = images.da;
-  void* workspace = images.workspace.of(ssim_workspace<S>(height, width, channels, da != nullptr));
-  const Plan<S> plan(height, width, channels, da != nullptr, workspace);
+  const Plan<S> plan = cut_space<Plan<S>>(images.workspace, height, width, channels, da != nullptr);
   const SsimWindow<S> window;
   const bool any = plan.count() > 0;
   if (any)

@@ -132,16 +132,11 @@ __global__ void __launch_bounds__(kThreads)
 }
 }  // namespace
 
-int64_t trace_mark_workspace(int64_t pairs) {
-  Arena arena(nullptr);
-  const MarkSpace w(arena, pairs);
-  return arena.used();
-}
+int64_t trace_mark_workspace(int64_t pairs) { return space_bytes<MarkSpace>(pairs); }
 
 template <class S> void trace_mark(const TraceMark<S>& a, Stream stream) {
   const int64_t pairs = a.pairs, tiles = tiles_of(a.view.width, a.view.height);
-  Arena arena(a.workspace.of(trace_mark_workspace(pairs)));
-  const MarkSpace w(arena, pairs);
+  const MarkSpace w = cut_space<MarkSpace>(a.workspace, pairs);
   const auto mark = a.alpha.values ? mark_kernel<S, true> : mark_kernel<S, false>;
   if (pairs) BT_LAUNCH(mark, dim3(unsigned(tiles)), dim3(kTileThreads), 0, stream, a);
   BT_LAUNCH_EACH(size_kernel, pairs + 1, kThreads, stream, pairs, a.tile_pairs + tiles, a.masks, w.counts);

@@ -36,8 +36,7 @@ template <class S> struct PictureSpace {
   }
 };
 template <class S> PictureSpace<S> picture_space(const Picture<S>& p) {
-  Arena arena(p.workspace.of(picture_workspace<S>(p.height, p.width)));
-  return PictureSpace<S>(arena, p.height, p.width);
+  return cut_space<PictureSpace<S>>(p.workspace, p.height, p.width);
 }
 
 // Applies the correction and adds the background; masked-out pixels are made equal in both pictures.
@@ -247,9 +246,7 @@ template <class S> __global__ void __launch_bounds__(kThreads) exposure_kernel(L
 }  // namespace
 
 template <class S> int64_t picture_workspace(int height, int width) {
-  Arena arena(nullptr);
-  const PictureSpace<S> space(arena, height, width);
-  return arena.used();
+  return space_bytes<PictureSpace<S>>(height, width);
 }
 
 template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream) {

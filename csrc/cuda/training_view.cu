@@ -47,23 +47,15 @@ template <class S> struct Spaces {
   TrainingView<S> v;
   ViewSpace<S> of;
 
-  explicit Spaces(const TrainingView<S>& view) : v(view), of(cut(view)) {
+  explicit Spaces(const TrainingView<S>& view)
+      : v(view), of(cut_space<ViewSpace<S>>(view.memory, view.surfels.n, view.width, view.height)) {
     v.table.base = of.base, v.picture.image = of.image, v.picture.workspace = of.picture;
   }
   PairSpace<S> pairs(const DrawView<S>& drawn) const {
-    const bool alpha = v.alpha.values;
-    const int64_t bytes = training_pairs_workspace(drawn.pairs, v.width, v.height, alpha, sizeof(S) == 8);
-    Arena arena(drawn.pair_memory.of(bytes));
-    return PairSpace<S>(arena, drawn.pairs, v.width, v.height, alpha);
+    return cut_space<PairSpace<S>>(drawn.pair_memory, drawn.pairs, v.width, v.height, v.alpha.values != nullptr);
   }
   View<S> view() const { return {v.surfels.n, v.geom, v.radii, v.width, v.height, v.near, S(1)}; }
   Directions<S> directions() const { return {v.surfels.n, v.surfels.means, v.center, of.active}; }
-
- private:
-  static ViewSpace<S> cut(const TrainingView<S>& v) {
-    Arena arena(v.memory.of(training_view_workspace<S>(v.surfels.n, v.width, v.height)));
-    return ViewSpace<S>(arena, v.surfels.n, v.width, v.height);
-  }
 };
 
 template <class S>
@@ -87,17 +79,11 @@ int64_t read_number(const int64_t* at, Stream stream) {
 }  // namespace
 
 template <class S> int64_t training_view_workspace(int64_t n, int width, int height) {
-  Arena arena(nullptr);
-  const ViewSpace<S> space(arena, n, width, height);
-  return arena.used();
+  return space_bytes<ViewSpace<S>>(n, width, height);
 }
 int64_t training_pairs_workspace(int64_t pairs, int width, int height, bool alpha, bool wide) {
-  Arena arena(nullptr);
-  if (wide)
-    PairSpace<double>(arena, pairs, width, height, alpha);
-  else
-    PairSpace<float>(arena, pairs, width, height, alpha);
-  return arena.used();
+  return wide ? space_bytes<PairSpace<double>>(pairs, width, height, alpha)
+              : space_bytes<PairSpace<float>>(pairs, width, height, alpha);
 }
 
 template <class S> int64_t count_view(const TrainingView<S>& a, Stream stream) {

@@ -32,7 +32,8 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 import bitymi_ns.capture.known_poses
 import bitymi_ns.capture.poses
-from scripts.fuzz_targets import CUT, ODD_VALUES, TARGETS, Target, no_colmap, nodes
+from scripts.fuzz_targets import CUT, TARGETS, Target, no_colmap
+from tests.hostile import mutated
 
 ODD_BYTES = [
     *(struct.pack(form, number) for form in "<d <f".split() for number in (0.0, -1.0, 1e-38, 3e38, np.nan, np.inf)),
@@ -47,20 +48,9 @@ ODD_BYTES = [
 
 
 def changed_json(data: bytes, dice: random.Random) -> bytes | None:
-    """Remove, exchange or replace a few entries of JSON; None if the data is no JSON."""
+    """Change a few entries of JSON; None if the data is no JSON."""
     try:
-        value = [json.loads(data)]
-        for _ in range(dice.choice((1, 1, 1, 2, 4))):
-            places = nodes(value)
-            (holder, key), (other, name) = dice.choice(places), dice.choice(places)
-            how = dice.randrange(4)
-            if how == 0 and holder is not value:
-                del holder[key]
-            elif how == 1:
-                holder[key] = json.loads(json.dumps(other[name]))
-            else:
-                holder[key] = dice.choice(ODD_VALUES)
-        return json.dumps(value[0]).encode("utf8", "surrogatepass")
+        return json.dumps(mutated([json.loads(data)], dice)[0]).encode("utf8", "surrogatepass")
     except (ValueError, RecursionError, IndexError):
         return None
 

@@ -37,14 +37,11 @@ from bitymi_ns.safe_reading import reading
 from bitymi_ns.sample import generate
 from bitymi_ns.scene.config import SceneConfig
 from tests.captures import as_binary, colmap_model
-from tests.hostile import parts, saved
+from tests.hostile import ODD_VALUES, nodes, parts, saved
 from tests.measure.report.conftest import cell
 from tests.plugin.run.test_checkpoints import moved, state
 
 CUT = b"\n--8<--\n"  # separates the files of an input
-ODD_NUMBERS = (0, -1, 1, 255, 1e-300, -1e308, float("nan"), float("inf"), 2**31, 2**62, 10**400, 0.1, True)
-ODD_TEXTS = ("", "32", "\0", "../../x", "images", "/", "\ud800", "x" * 5000, "OPENCV", "é/..", "SIMPLE_RADIAL_FISHEYE")
-ODD_VALUES = (*ODD_NUMBERS, *ODD_TEXTS, None, [], {}, [[]], [1.0, 2.0, 3.0], [[0.0] * 4] * 4, {"a": None})
 
 
 @dataclass
@@ -55,14 +52,6 @@ class Target:
     seeds: list[bytes]
     refusals: tuple[type[BaseException], ...] = ()  # documented exceptions
     json: bool = False  # the last file of an input is JSON or JSONL
-
-
-def nodes(value: Any) -> list[tuple[Any, Any]]:
-    """List all entries of nested dicts and lists, as container and key."""
-    found = []
-    for key in list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
-        found += [(value, key), *nodes(value[key])]
-    return found
 
 
 def no_colmap(*_: Any, **__: Any) -> Any:

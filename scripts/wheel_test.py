@@ -62,14 +62,9 @@ def run(*command: str | Path, cwd: Path = ROOT) -> None:
 def build(folder: Path) -> Path:
     """Build the wheel in `folder` and return its path."""
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
-    options = (
-        "-q",
-        "--no-build-isolation",
-        "--no-deps",
-        "--no-index",
-        "--config-settings=cmake.define.BITYMI_CUDA=OFF",
-    )
-    run(*pip, "wheel", *options, f"--config-settings=build-dir={folder / 'build'}", "-w", folder, ROOT)
+    options = ("-q", "--no-build-isolation", "--no-deps", "--no-index")
+    settings = ("cmake.define.BITYMI_CUDA=OFF", f"build-dir={folder / 'build'}")
+    run(*pip, "wheel", *options, *(f"--config-settings={each}" for each in settings), "-w", folder, ROOT)
     (wheel,) = folder.glob("bitymi_ns-*.whl")
     return wheel
 

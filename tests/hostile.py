@@ -1,19 +1,54 @@
-"""Checkpoints made to harm whoever loads them, from the bytes of one that loads."""
+"""Checkpoints made to harm whoever loads them, from the bytes of one that loads; JSON with odd entries."""
 
+import copy
 import io
 import os
 import pickle
+import random
 import tarfile
 import warnings
 import zipfile
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
 Make = Callable[[bytes, Path], bytes]  # of a good checkpoint's bytes, and a file that code in the result would make
+
+
+ODD_NUMBERS = (0, -1, 1, 2, 255, 0.1, -0.0, 1e-300, 5e-324, 1e9, 1e308, -1e308, float("nan"), float("inf"), 10**400)
+ODD_NUMBERS += (2**31, 2**62, True, False)
+ODD_TEXTS = ("", "x", "32", "\0", "../../x", "images", "pixel", "sh", "/", "\u202e\ud800", "x" * 5000, "OPENCV", "é/..")
+ODD_VALUES = (*ODD_NUMBERS, *ODD_TEXTS, None, [], {}, [[]], [1.0, 2.0, 3.0], [[0.0] * 4] * 4, {"a": None})
+
+
+def nodes(value: Any) -> list[tuple[Any, Any]]:
+    """List all entries of nested dicts and lists, as container and key."""
+    found = []
+    for key in list(value) if isinstance(value, dict) else range(len(value)) if isinstance(value, list) else ():
+        found += [(value, key), *nodes(value[key])]
+    return found
+
+
+def mutated(value: Any, dice: random.Random, odd: Sequence[Any] = ODD_VALUES) -> Any:
+    """Replace, remove, copy or scale one to three values in nested dicts and lists, or rename their keys."""
+    value = copy.deepcopy(value)
+    for _ in range(dice.choice((1, 1, 2, 3))):
+        (holder, key), (other, name) = dice.choice(places := nodes(value)), dice.choice(places)
+        kind, number = dice.randrange(6), holder[key] if isinstance(holder[key], (int, float)) else None
+        if kind == 0:
+            del holder[key]
+        elif kind == 1:
+            holder[key] = copy.deepcopy(other[name])
+        elif kind == 2 and number is not None and not isinstance(number, bool) and abs(number) <= 1e308:
+            holder[key] = max(-1e308, min(number * dice.choice((-1, 0.5, 2, 10, 1e6, 1e-6, 1e30)), 1e308))
+        elif kind == 3 and isinstance(holder, dict):
+            holder[key + "x"] = holder.pop(key)
+        else:
+            holder[key] = copy.deepcopy(dice.choice(odd))
+    return value
 
 
 class Call:

@@ -2,17 +2,12 @@
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import pytest
 
-
-@pytest.fixture
-def remedy(load: Callable[[str], ModuleType]) -> ModuleType:
-    return load("torchvision_remedy")
+from scripts import torchvision_remedy as remedy
 
 
 def python(code: str, *path: Path) -> subprocess.CompletedProcess[str]:
@@ -56,9 +51,7 @@ def fake(folder: Path, version: str, cuda: str | None) -> None:
     ("version", "cuda", "works"),
     [("0.28.0+cu130", None, True), ("0.28.0+cpu", None, False), ("0.28.0+cu130", "13.0", False)],
 )
-def test_acts_only_on_the_mismatch(
-    tmp_path: Path, remedy: ModuleType, version: str, cuda: str | None, works: bool
-) -> None:
+def test_acts_only_on_the_mismatch(tmp_path: Path, version: str, cuda: str | None, works: bool) -> None:
     fake(tmp_path, version, cuda)
     (tmp_path / "shim_under_test.py").write_text(remedy.SHIM)
     code = "import sys\nsys.meta_path = [f for f in sys.meta_path if type(f).__name__ != '_Finder']\n"
@@ -76,7 +69,7 @@ NMS = "RuntimeError: operator torchvision::nms does not exist"
     [([""], 0, 0), ([NMS, ""], 0, 2), ([NMS, "still broken"], 1, 0), (["ImportError: something else"], 1, 0)],
 )
 def test_files_are_written_when_needed_and_taken_back(
-    tmp_path: Path, remedy: ModuleType, monkeypatch: pytest.MonkeyPatch, errors: Any, status: int, left: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, errors: Any, status: int, left: int
 ) -> None:
     answers, files = iter(errors), (tmp_path / "shim.py", tmp_path / "shim.pth")
     monkeypatch.setattr(remedy, "shim_files", lambda: files)
@@ -86,6 +79,6 @@ def test_files_are_written_when_needed_and_taken_back(
     assert len(list(tmp_path.iterdir())) == left
 
 
-def test_refuses_outside_a_virtual_environment(remedy: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_refuses_outside_a_virtual_environment(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "base_prefix", sys.prefix)
     assert remedy.main() == 2

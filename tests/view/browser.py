@@ -7,13 +7,17 @@ import re
 import select
 import shutil
 import subprocess
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 from threading import Thread
 from typing import Any
+
+import numpy as np
+from PIL import Image
 
 from bitymi_ns.view import Site, address_of, serve
 from tests.required import skip_without
@@ -105,6 +109,24 @@ def served(site: Site, **options: Any) -> AbstractContextManager[str]:
     return running(serve(site, **options))
 
 
+def held_back(site: Site, name: str, until: Path) -> Site:
+    """Make the site withhold a file until another one exists."""
+
+    def late() -> bytes:
+        for _ in range(600):
+            if until.exists():
+                break
+            time.sleep(0.1)
+        return site.read(name)
+
+    return replace(site, files={**site.files, name: late})
+
+
+def pixels(picture: Path) -> np.ndarray:
+    """Read a picture: float32 [H, W, 3] in [0, 1]."""
+    return np.asarray(Image.open(picture).convert("RGB"), np.float32) / 255
+
+
 @contextmanager
 def plain_server(folder: Path, ranges: bool) -> Iterator[tuple[str, list[tuple[str, int]]]]:
     """Serve a folder like a plain file server.
@@ -136,7 +158,5 @@ def plain_server(folder: Path, ranges: bool) -> Iterator[tuple[str, list[tuple[s
         def log_message(self, format: str, *args: object) -> None:
             """Log nothing."""
 
-    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Plain, directory=str(folder))) as server:
-        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}/", asked
-        server.shutdown()
+    with running(http.server.ThreadingHTTPServer(("127.0.0.1", 0), partial(Plain, directory=str(folder)))) as address:
+        yield address, asked

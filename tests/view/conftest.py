@@ -108,5 +108,11 @@ def write(
 
 
 @pytest.fixture(scope="session")
+def solid(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle whose surfels have no gaps in the middle."""
+    return write(tmp_path_factory.mktemp("view") / "solid", larger=1.5)
+
+
+@pytest.fixture(scope="session")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write(tmp_path_factory.mktemp("view") / "little")

@@ -6,13 +6,12 @@ from contextlib import contextmanager
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from threading import Thread
 from urllib.parse import unquote, urlsplit
 
 import pytest
 
 from bitymi_ns.view import single_site, site_of, write_static
-from tests.view.browser import drive
+from tests.view.browser import drive, running
 
 pytestmark = pytest.mark.slow
 
@@ -37,10 +36,8 @@ class _Clean(SimpleHTTPRequestHandler):
 
 @contextmanager
 def clean_server(folder: Path) -> Iterator[str]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Clean, directory=str(folder))) as server:
-        Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True).start()
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-        server.shutdown()
+    with running(ThreadingHTTPServer(("127.0.0.1", 0), partial(_Clean, directory=str(folder)))) as address:
+        yield address.rstrip("/")
 
 
 @pytest.fixture(scope="module")

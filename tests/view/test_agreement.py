@@ -68,6 +68,17 @@ def numbers(data: bytes) -> Damage:
     return damage
 
 
+def flipped(name: str) -> Damage:
+    """Flip a bit in the header of a file's first frame."""
+
+    def damage(bundle: Path) -> None:
+        data = bytearray((bundle / name).read_bytes())
+        data[4] ^= 8
+        (bundle / name).write_bytes(data)
+
+    return damage
+
+
 def positions(rows: int, first: int = 0) -> bytes:
     """Encode differences of positions."""
     return compress(np.array([first, *range(rows - 1)])[:, None]).data
@@ -104,6 +115,8 @@ TABLE: list[tuple[str, str, Damage, bool]] = [
     ("a column that a byte follows", "compact", numbers(positions(COUNT) + b"\0"), False),
     ("a column without bytes", "compact", numbers(b""), False),
     ("a column with a long head", "compact", numbers(b"\xff" * 40), False),
+    ("a bit of the surfels", "compact", flipped("surfels.bin"), False),
+    ("a bit of the texels", "compact", flipped("texels.bin"), False),
 ]
 
 

@@ -6,7 +6,6 @@ it, else in half.
 
 import hashlib
 import json
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from bitymi_ns.train.losses import psnr
 from bitymi_ns.view import Site, site_of, write_static
 from tests.bundle.damage import amend
 from tests.cuda.baked_scenes import front
-from tests.view.browser import drive, plain_server, served
+from tests.view.browser import drive, held_back, pixels, plain_server, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 
 SCREEN = (WIDTH, HEIGHT)
@@ -37,7 +36,7 @@ def difference(path: Path, bundle: Path | BakedScene, share: float = 1.0) -> tup
     """Compute the mean and largest difference of a saved picture (of relative size `share`) from the CPU's."""
     scene = bundle if isinstance(bundle, BakedScene) else read_bundle(bundle).scene
     want = scene.render(view().scaled(share)).rgb.clamp(0, 1).numpy()
-    got = np.asarray(Image.open(path).convert("RGB"), np.float32) / 255
+    got = pixels(path)
     assert got.shape == want.shape
     off = np.abs(got - want)
     return float(off.mean()), float(off.max())
@@ -81,7 +80,7 @@ def test_far_views_are_averages_of_near_ones(share: float, least: float, tmp_pat
     with served(site_of(bundle)) as address:
         steps = [["goto", address], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]]
         assert not drive(steps, (round(WIDTH * share), round(HEIGHT * share))).problems
-    got = torch.from_numpy(np.asarray(Image.open(tmp_path / "p.png").convert("RGB"), np.float32) / 255)
+    got = torch.from_numpy(pixels(tmp_path / "p.png"))
     full = read_bundle(bundle).scene.render(view()).rgb[None]
     assert psnr(got, averaged({"rgb": full}, round(1 / share))["rgb"][0].clamp(0, 1)) > least
 
@@ -98,7 +97,7 @@ def test_of_far_scenes_the_part_with_the_scene_is_drawn(tmp_path: Path) -> None:
     scene = read_bundle(bundle).scene
     how = scene.sampling([camera])
     assert how.samples == 9 and how.part is not None and how.part[2] - how.part[0] < WIDTH // 4
-    got = torch.from_numpy(np.asarray(Image.open(tmp_path / "p.png").convert("RGB"), np.float32) / 255)
+    got = torch.from_numpy(pixels(tmp_path / "p.png"))
     want = scene.render(camera).rgb.clamp(0, 1)
     assert psnr(got, want) > 50.0 and float(want.max()) > 0.2
 
@@ -109,37 +108,14 @@ def test_the_first_picture_needs_no_texels(tmp_path: Path) -> None:
     bundle = write(tmp_path / "b", "uint8", compact=True, alpha=True)
     single, first = tmp_path / "b.bitymi", tmp_path / "first.png"
     write_single(bundle, single)
-    site = site_of(single)
-
-    def late() -> bytes:
-        for _ in range(600):
-            if first.exists():
-                break
-            time.sleep(0.1)
-        return site.read("bundle/texels.bin")
-
-    slow = replace(site, files={**site.files, "bundle/texels.bin": late})
     steps = [["first"], ["save", "#screenshot", first], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]]
-    with served(slow) as address:
+    with served(held_back(site_of(single), "bundle/texels.bin", first)) as address:
         found = drive([["goto", address], *steps], SCREEN)
     assert not found.problems
     scene = read_bundle(single).scene
     plain = replace(scene, atlas=None, tiles=torch.zeros_like(scene.tiles))
     assert difference(first, plain)[0] < MEAN and difference(tmp_path / "p.png", bundle)[0] < MEAN
     assert difference(first, bundle)[0] > 4 * difference(first, plain)[0]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["surfels.bin", "texels.bin"])
-def test_a_damaged_compact_bundle_gets_a_page_that_says_so(name: str, tmp_path: Path) -> None:
-    """With a valid hash, as for deliberate damage."""
-    bundle = write(tmp_path / "b", "uint8", compact=True)
-    data = bytearray((bundle / name).read_bytes())
-    data[4] ^= 8  # in the first frame's header
-    (bundle / name).write_bytes(data)
-    amend(bundle, lambda info: info["files"][name].update(sha256=hashlib.sha256(data).hexdigest()))
-    state, text = page_of(site_of(bundle))
-    assert state == "error" and "damaged" in text and "a column is damaged" in text
 
 
 @pytest.mark.slow

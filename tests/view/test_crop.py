@@ -38,11 +38,6 @@ def slide(name: str, value: float) -> list[object]:
 
 
 @pytest.fixture(scope="module")
-def solid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write(tmp_path_factory.mktemp("crop") / "solid", larger=1.5)
-
-
-@pytest.fixture(scope="module")
 def cropped(solid: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, str]:
     """A bundle with notes.json from the page, and what the page showed: surfels, labels of measures."""
     folder = tmp_path_factory.mktemp("cropped")

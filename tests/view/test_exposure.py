@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.scene import Camera
 from bitymi_ns.train.views import shown
 from tests.bundle.damage import amend
+from tests.view.browser import pixels
 from tests.view.conftest import HEIGHT, WIDTH, write
 from tests.view.steps import Seen, Steps
 from tests.view.test_browser import MEAN
@@ -71,11 +71,9 @@ def test_a_photograph_s_exposure_is_shown_at_its_camera(tmp_path: Path) -> None:
     page.run(bundle, drawn=True, quarter=False, viewport=(WIDTH, HEIGHT))
 
     assert page[switch] == "false,true" and page[off] == "false"
-    pictures = {
-        name: np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB"), np.float32) / 255 for name in names
-    }
     made, background = read_bundle(bundle), torch.tensor(BACKGROUND)
-    for name, picture in pictures.items():
+    for name in names:
+        picture = pixels(tmp_path / f"{name}.png")
         row = made.cameras[int(name[0])]
         drawn = made.render(row.camera if "moved" not in name else at(page.seen(moved), row.camera))
         mean = drawn.rgb.clamp(0, 1).numpy()

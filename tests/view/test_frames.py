@@ -10,14 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.ops import webgpu
 from bitymi_ns.view import single_site, write_static
 from tests.required import skip_without
-from tests.view.browser import drive, plain_server
+from tests.view.browser import drive, pixels, plain_server
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 from tests.view.test_browser import MEAN
 
@@ -84,8 +83,7 @@ def test_in_a_browser(bundles: dict[str, Path], tmp_path: Path) -> None:
         found = drive(asked, (WIDTH, HEIGHT), patience=200)
     assert not found.problems
     for name, bundle in drawn.items():
-        got = np.asarray(Image.open(tmp_path / f"{bundle.name}.png").convert("RGB"), np.float32) / 255
-        check(name, got, wanted(bundle))
+        check(name, pixels(tmp_path / f"{bundle.name}.png"), wanted(bundle))
 
 
 def test_through_wgpu(bundles: dict[str, Path]) -> None:

@@ -13,7 +13,6 @@ from bitymi_ns.bundle.notes import parse_notes
 from bitymi_ns.view import single_site, site_of, write_static
 from tests.bundle.test_notes import NOTES, text
 from tests.view.browser import drive, plain_server
-from tests.view.conftest import write
 from tests.view.steps import PHONE, START, Steps
 from tests.view.test_path import FITS, SECOND, there
 
@@ -28,12 +27,6 @@ MARKERS = (
     "behind: e.classList.contains('behind'), x: parseFloat(e.style.left), y: parseFloat(e.style.top)}))"
 )
 HTML = "<img src=x onerror=alert(1)>"
-
-
-@pytest.fixture(scope="module")
-def solid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bundle whose surfels have no gaps in the middle."""
-    return write(tmp_path_factory.mktemp("notes") / "solid", larger=1.5)
 
 
 @pytest.fixture

@@ -1,8 +1,6 @@
 """The poster on the page: shown before the surfels, aligned with the first picture, removed with it."""
 
-import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ from bitymi_ns.bundle.manifest import POSTER
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.view import Site, single_site, site_of, write_static
 from tests.bundle.damage import amend
-from tests.view.browser import Outcome, drive, plain_server, served
+from tests.view.browser import Outcome, drive, held_back, pixels, plain_server, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
 from tests.view.test_browser import MEAN, difference
 
@@ -29,19 +27,6 @@ BARE = (
     "for (const id of ['page', 'top', 'panel', 'menu', 'notice'])"
     "document.getElementById(id).style.visibility = 'hidden'"
 )
-
-
-def held_back(site: Site, name: str, until: Path) -> Site:
-    """Make the site withhold a file until another one exists."""
-
-    def late() -> bytes:
-        for _ in range(600):
-            if until.exists():
-                break
-            time.sleep(0.1)
-        return site.read(name)
-
-    return replace(site, files={**site.files, name: late})
 
 
 def kept(site: Site, asked: list[str]) -> Site:
@@ -66,8 +51,7 @@ def shots(bundle: Path, folder: Path, size: tuple[int, int], **options: Any) -> 
         steps[0] = ["goto", address]
         found = drive(steps, size, **options)
     assert not found.problems
-    pictures = [np.asarray(Image.open(path).convert("RGB"), np.float32) / 255 for path in (first, second)]
-    return pictures[0], pictures[1], found
+    return pixels(first), pixels(second), found
 
 
 @pytest.mark.parametrize(

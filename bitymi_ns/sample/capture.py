@@ -1,9 +1,9 @@
 """Render the sample room along a camera path and write it as a nerfstudio capture."""
 
 import json
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 from PIL import Image as PILImage
 
 from bitymi_ns.capture.image_files import in_threads
+from bitymi_ns.capture.lens import Pinhole
 from bitymi_ns.files import complete_folder
 from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.safe_reading import read_json
-from bitymi_ns.sample.room import Room, RoomHits
+from bitymi_ns.sample.room import Room
 from bitymi_ns.trust import check_replaceable
 
 FOCAL = 0.80  # focal length in image widths
@@ -25,8 +26,7 @@ CAPTURE, CLOUD = "transforms.json", "sparse_pc.ply"
 MADE_BY = "bitymi sample"  # marks transforms.json: only folders with this mark are overwritten
 
 
-@dataclass(frozen=True)
-class RoomView:
+class RoomView(NamedTuple):
     """One pinhole camera: camera-to-world [4, 4] with OpenGL axes (x right, y up, z backward), pixel intrinsics."""
 
     camera_to_world: NDArray[np.float64]
@@ -36,10 +36,8 @@ class RoomView:
 
     def rays(self, supersample: int = 1) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Compute the origin [3, 1] and unit directions [3, H s W s] of rays through s by s subpixel centres."""
-        h, w = self.height * supersample, self.width * supersample
-        x = ((np.arange(w) + 0.5) / supersample - self.width / 2) / self.focal
-        y = (self.height / 2 - (np.arange(h) + 0.5) / supersample) / self.focal
-        d = np.stack(np.broadcast_arrays(x[None, :], y[:, None], -1.0), axis=-1) @ self.camera_to_world[:3, :3].T
+        focal, w, h = (supersample * value for value in (self.focal, self.width, self.height))
+        d = Pinhole(focal, focal, w / 2, h / 2, w, h).rays * (1, -1, -1) @ self.camera_to_world[:3, :3].T
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return self.camera_to_world[:3, 3:].astype(np.float32), np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)
 
@@ -74,17 +72,19 @@ def render(room: Room, view: RoomView, supersample: int = 3) -> NDArray[np.uint8
     """Render a view with antialiasing: [H, W, 3]."""
     o, directions = view.rays(supersample)
     bands = np.split(directions, range(BAND, directions.shape[1], BAND), axis=1)
-    color = np.concatenate([room.color(o, d, room.hit(o, d)) for d in bands])
+    color = np.concatenate([room.color(o, d) for d in bands])
     color = color.reshape(view.height, supersample, view.width, supersample, 3).mean(axis=(1, 3))
     return (color * 255 + 0.5).astype(np.uint8)
 
 
-def first_hits(room: Room, view: RoomView, pixels: NDArray[np.int64]) -> tuple[NDArray[np.float32], RoomHits]:
-    """Trace the centres of pixels, flat indices [n]: world points [n, 3], and the hits."""
+def first_hits(
+    room: Room, view: RoomView, pixels: NDArray[np.int64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int8]]:
+    """Trace the centres of pixels, flat indices [n]: world points [n, 3], distances [n] and surfaces [n]."""
     o, directions = view.rays()
     d = directions.take(pixels, 1)
-    hits = room.hit(o, d)
-    return (o + hits.t * d).T, hits
+    t, surfaces = room.hit(o, d)
+    return (o + t * d).T, t, surfaces
 
 
 def sparse_points(
@@ -115,17 +115,10 @@ def generate(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
-    """Write the sample capture to `output_dir` and return that folder.
-
-    It contains transforms.json (one shared pinhole camera, exact poses), images/frame_00001.png etc., and
-    sparse_pc.ply. Equal arguments give equal images. The folder is written to a temporary name and renamed, so that it
-    is complete or absent.
-
-    Raises:
-        ValueError: an argument is too small.
-        FileExistsError: the folder already holds files that are not a sample, or `overwrite` is False.
-        NotADirectoryError: it is a file.
-    """
+    """Write transforms.json (one shared pinhole camera, exact poses), images/frame_00001.png etc. and sparse_pc.ply to
+    `output_dir`, whole or not at all, and return that folder. Equal arguments give equal files. Raises ValueError: an
+    argument is too small; FileExistsError: the folder holds files that are not a sample's, or `overwrite` is False;
+    NotADirectoryError: it is a file."""
     limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
     for name, (value, least) in limits.items():
         if value < least:
@@ -147,15 +140,12 @@ def generate(
             return image
 
         write_cloud(new / CLOUD, *sparse_points(room, path, in_threads(frame, range(views)), points, seed))
+        frames = [{"file_path": _image(k), "transform_matrix": v.camera_to_world.tolist()} for k, v in enumerate(path)]
         meta = {
             **{"made_by": MADE_BY, "camera_model": "OPENCV", "w": width, "h": height},
             **{"fl_x": FOCAL * width, "fl_y": FOCAL * width, "cx": width / 2, "cy": height / 2},
             **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0),
-            "ply_file_path": CLOUD,
-            "frames": [
-                {"file_path": _image(k), "transform_matrix": view.camera_to_world.tolist()}
-                for k, view in enumerate(path)
-            ],
+            **{"ply_file_path": CLOUD, "frames": frames},
         }
         (new / CAPTURE).write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
     return output_dir

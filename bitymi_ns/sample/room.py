@@ -1,10 +1,10 @@
 """The sample room and its ray tracer, in numpy.
 
 World frame: metres, x and y along the floor, z up. Points and directions of n rays are float32 [3, n], origins also
-[3, 1]; t is in units of the direction's length. Lighting of walls and floor is baked into their textures; sphere and
-box are glossy. Colors are display values in [0, 1]."""
+[3, 1]; t [n] is in units of the direction's length, surfaces [n] are int8. Lighting of walls and floor is baked into
+their textures; sphere and box are glossy. Colors are display values in [0, 1]."""
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -13,91 +13,97 @@ from bitymi_ns.sample.textures import Image
 
 LOW = np.array([[-3.0], [-2.5], [0.0]], np.float32)
 HIGH = np.array([[3.0], [2.5], [2.6]], np.float32)
-WALLS = (
-    (textures.bricks, (), ((1.1, 0.8, "noise", 2.9, 1.1), (0.9, 1.2, "text", 0.8, 0.8))),
-    (textures.wallpaper, (), ((1.2, 1.2, "rings", 0.7, 0.8), (1.3, 0.9, "text", 2.9, 1.0))),
-    (
-        textures.plaster, ((0.80, 0.66, 0.45),),
-        ((1.5, 1.0, "bars", 0.7, 1.0), (1.0, 1.4, "text", 2.7, 0.7), (1.2, 0.9, "noise", 4.2, 1.0)),
-    ),
-    (textures.plaster, ((0.62, 0.70, 0.78),), ((0.9, 1.1, "rings", 0.4, 0.9), (1.0, 1.3, "bars", 4.6, 0.8))),
+SIDES = (
+    (textures.bricks, ((1.1, 0.8, "noise", 2.9, 1.1), (0.9, 1.2, "text", 0.8, 0.8))),
+    (textures.wallpaper, ((1.2, 1.2, "rings", 0.7, 0.8), (1.3, 0.9, "text", 2.9, 1.0))),
+    (partial(textures.plaster, color=(0.80, 0.66, 0.45)),
+     ((1.5, 1.0, "bars", 0.7, 1.0), (1.0, 1.4, "text", 2.7, 0.7), (1.2, 0.9, "noise", 4.2, 1.0))),
+    (partial(textures.plaster, color=(0.62, 0.70, 0.78)),
+     ((0.9, 1.1, "rings", 0.4, 0.9), (1.0, 1.3, "bars", 4.6, 0.8))),
+    (textures.wood_tiles, ()),
+    (partial(textures.plaster, color=(0.92, 0.92, 0.90)), ()),
 )  # fmt: skip
-"""Painter of each wall, its colour, and posters: width, height, kind, left and bottom edge."""
+"""Painters and posters (width, height, kind, left and bottom edge) of x low, x high, y low, y high, floor, ceiling."""
+AXES = ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1), (1, 0, 2))
+"""World axes of each side's normal, and of its texture's u and v; of the landscape, too."""
+MIRRORED = (1, 2)  # sides whose u runs against its axis, so that it points right for a viewer inside the room
 WINDOW = (-1.3, 1.1, 0.75, 2.15)  # x0, x1, z0, z1 of the opening in the wall y = HIGH[1]
-OUTSIDE = (-40.0, 40.0, -5.0, 15.0)  # x0, x1, z0, z1 of the landscape image
-OUTSIDE_Y = 30.0
+OUTSIDE = np.array([[-40.0], [30.0], [-5.0]], np.float32), np.array([[40.0], [30.0], [15.0]], np.float32)
+"""Lower left and upper right corner of the landscape image."""
 LAMP = (-0.6, 0.9, -0.7, 0.1)  # x0, x1, y0, y1 of the light in the ceiling
-
-BOX_CENTRE, BOX_HALF = np.array([[0.65], [-0.05], [0.38]], np.float32), np.array([[0.32], [0.26], [0.38]], np.float32)
-BOX_REACH = np.array([[np.hypot(*BOX_HALF[:2, 0])]] * 2 + [BOX_HALF[2]], np.float32)  # half sides of its bounds
-BOX_COS, BOX_SIN = np.cos(np.float32(0.5)), np.sin(np.float32(0.5))  # of its yaw
-PLINTH = (np.array([[-0.85], [-0.20], [0.0]], np.float32), np.array([[-0.25], [0.40], [0.44]], np.float32))
-POLES = [(1.55, 0.95, 0.022, 2.6), (1.25, -0.95, 0.012, 1.35), (-1.45, -0.85, 0.016, 1.7)]  # x, y, radius, height
-
-# Surfaces. 0 to 5 are the room's sides: x low, x high, y low, y high, floor, ceiling.
-LANDSCAPE, SPHERE, BOX, PLINTH_ID, BARS, POLE, KNOB = range(6, 13)
-SIDE_AXES = ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1))
-"""World axes of the normal of a side, of its texture's u and of its v."""
-BALLS = {
-    SPHERE: (np.array([[-0.55], [0.10], [0.80]], np.float32), 0.36, (0.16, 0.20, 0.30), 0.55),
-    KNOB: (np.array([[1.25], [-0.95], [1.37]], np.float32), 0.07, (0.85, 0.15, 0.10), 0.0),
-}
-"""Centre, radius, colour and gloss."""
+YAW_COS, YAW_SIN = np.cos(np.float32(0.5)), np.sin(np.float32(0.5))
 NEAR = np.float32(1e-4)
 
 
-UPRIGHTS, RUNGS = 8, 7  # thin bars of the lattice behind the sphere
+class Solid:
+    """Box, turned about its middle with `yaw`, or with `axes` the ball (3) or upright pole (2) in it. Corners (of a
+    turned box from its center), center and half sides are [3, 1]."""
+
+    def __init__(
+        self, *sides: float, color: tuple[float, ...] | str, gloss: float = 0.0, axes: int = 0, yaw: bool = False
+    ) -> None:
+        """`sides`: x low, x high, y low, y high, z low, z high; `color`, or the name of a texture."""
+        low, high = np.reshape(sides, (3, 2, 1)).transpose(1, 0, 2)
+        center, half = (low + high) / 2, (high - low) / 2
+        low, high = (-half, half) if yaw else (low, high)
+        self.low, self.high, self.center, self.half = (part.astype(np.float32) for part in (low, high, center, half))
+        self.radius = float(half[0, 0])
+        self.reach = self.half * np.float32(1.6 if yaw else 1.0001)  # half sides of its bounds
+        self.color, self.gloss, self.axes, self.yaw = color, gloss, axes, yaw
+
+    def enter(self, o: Image, d: Image, inverse: Image) -> tuple[Image, np.ndarray]:
+        """Compute the t at which rays enter, and whether they do."""
+        if self.axes:
+            oc, dc = (o - self.center)[: self.axes], d[: self.axes]
+            a, b, c = _dot(dc, dc), _dot(oc, dc), _dot(oc, oc) - np.float32(self.radius * self.radius)
+            root = b * b - a * c
+            t = (-b - np.sqrt(np.maximum(root, 0))) / a
+            z = o[2] + t * d[2]
+            return t, (root > 0) & ((self.axes == 3) | (z > self.low[2]) & (z < self.high[2]))
+        if self.yaw:
+            o, inverse = _turned(o - self.center), np.float32(1) / _turned(d)
+        near, far = _slab(o, inverse, self.low, self.high)
+        return near, near < far
+
+    def normals(self, p: Image) -> tuple[Image, Image, Image]:
+        """Compute outward normals [3, n] of points on the surface, and coordinates u, v in [0, 1] on a box's faces."""
+        if self.axes:
+            normal = (p - self.center) / np.float32(self.radius)
+            normal[self.axes :] = 0
+            return normal, p[0], p[1]
+        local = _turned(p - self.center) if self.yaw else p
+        ratio = (local - (self.low + self.high) / 2) / ((self.high - self.low) / 2)
+        axis = np.abs(ratio).argmax(0)
+        normal = np.where(axis == [[0], [1], [2]], np.sign(ratio), 0).astype(np.float32)
+        u, v = np.where(axis == 0, ratio[1], ratio[0]), np.where(axis == 2, ratio[1], ratio[2])
+        normal = _turned(normal, -YAW_SIN) if self.yaw else normal
+        return normal, u * np.float32(0.5) + np.float32(0.5), v * np.float32(0.5) + np.float32(0.5)
 
 
-def _bars() -> np.ndarray:
-    """Build the corners (low, high), [2, m, 3, 1], of the bars: a free-standing lattice and the window's cross."""
-    bars = [(x, x + 0.014, 1.000, 1.014, 0.0, 1.35) for x in (-1.75 + 0.17 * k for k in range(UPRIGHTS))]
-    bars += [(-1.80, -0.50, 1.014, 1.026, z, z + 0.012) for z in (0.12 + 0.19 * k for k in range(RUNGS))]
-    (x0, x1, z0, z1), y = WINDOW, float(HIGH[1, 0])
-    bars.append(((x0 + x1) / 2 - 0.02, (x0 + x1) / 2 + 0.02, y - 0.03, y, z0, z1))
-    bars.append((x0, x1, y - 0.03, y, (z0 + z1) / 2 - 0.015, (z0 + z1) / 2 + 0.015))
-    return np.array(bars, np.float32).reshape(-1, 3, 2, 1).transpose(2, 0, 1, 3)
-
-
-BARS_LOW, BARS_HIGH = _bars()
-
-
-@dataclass
-class RoomHits:
-    """First hits of n rays."""
-
-    t: Image  # [n] distance in direction lengths
-    surface: np.ndarray  # [n] int8, index of the surface
-    part: np.ndarray  # [n] int8, index of the bar or pole
-
-    def candidates(self, o: Image, inverse: Image, low: Image, high: Image) -> np.ndarray:
-        """Find the rays, as indices, that enter an axis-aligned box before their hits."""
-        near, far = _slab(o, inverse, low, high)
-        return np.flatnonzero((near < far) & (far > NEAR) & (near < self.t))
-
-    def shorten(self, index: np.ndarray, t: Image, meets: np.ndarray | bool, surface: int, part: int = 0) -> None:
-        """Update the hits of rays that meet a surface at a smaller t."""
-        closer = meets & (t > NEAR) & (t < self.t[index])
-        chosen = index[closer]
-        self.t[chosen], self.surface[chosen], self.part[chosen] = t[closer], surface, part
-
-
-def _dot(a: Image, b: Image) -> Image:
-    return (a * b).sum(0)
-
-
-def _slab(o: Image, inverse: Image, low: np.ndarray, high: np.ndarray) -> tuple[Image, Image]:
-    """Compute entry and exit t of rays through an axis-aligned box."""
-    t0, t1 = (low - o) * inverse, (high - o) * inverse
-    return np.minimum(t0, t1).max(0), np.maximum(t0, t1).min(0)
-
-
-def _round(o: Image, d: Image, centre: Image, radius: float) -> tuple[Image, np.ndarray]:
-    """Compute the t at which rays enter a ball, or with two axes a pole, and whether they meet it."""
-    oc = o - centre
-    a, b, c = _dot(d, d), _dot(oc, d), _dot(oc, oc) - np.float32(radius * radius)
-    root = b * b - a * c
-    return (-b - np.sqrt(np.maximum(root, 0))) / a, root > 0
+_X, _Z = (WINDOW[0] + WINDOW[1]) / 2, (WINDOW[2] + WINDOW[3]) / 2
+_FRAME = float(HIGH[1, 0]) - 0.03, float(HIGH[1, 0])
+GROUPS = (
+    [Solid(-0.91, -0.19, -0.26, 0.46, 0.44, 1.16, color=(0.16, 0.20, 0.30), gloss=0.55, axes=3)],
+    [Solid(1.18, 1.32, -1.02, -0.88, 1.30, 1.44, color=(0.85, 0.15, 0.10), axes=3)],
+    [Solid(0.33, 0.97, -0.31, 0.21, 0.0, 0.76, color="box", gloss=0.10, yaw=True)],
+    [Solid(-0.85, -0.25, -0.20, 0.40, 0.0, 0.44, color="plinth")],
+    [Solid(1.528, 1.572, 0.928, 0.972, 0.0, 2.6, color="stripes", axes=2)],
+    [Solid(1.238, 1.262, -0.962, -0.938, 0.0, 1.35, color=(0.85, 0.85, 0.82), axes=2)],
+    [Solid(-1.466, -1.434, -0.866, -0.834, 0.0, 1.7, color=(0.85, 0.85, 0.82), axes=2)],
+    [  # a lattice of thin bars behind the sphere
+        *(Solid(x, x + 0.014, 1.000, 1.014, 0.0, 1.35, color=(0.75, 0.60, 0.20))
+          for x in (-1.75 + 0.17 * k for k in range(8))),
+        *(Solid(-1.80, -0.50, 1.014, 1.026, z, z + 0.012, color=(0.12, 0.12, 0.12))
+          for z in (0.12 + 0.19 * k for k in range(7))),
+    ],
+    [  # the window's cross
+        Solid(_X - 0.02, _X + 0.02, *_FRAME, *WINDOW[2:], color=(0.92, 0.92, 0.90)),
+        Solid(*WINDOW[:2], *_FRAME, _Z - 0.015, _Z + 0.015, color=(0.92, 0.92, 0.90)),
+    ],
+)  # fmt: skip
+"""Solids that are near each other."""
+SOLIDS = [solid for group in GROUPS for solid in group]
+LANDSCAPE, FIRST = 6, 7  # surfaces, after those of SIDES; from FIRST on SOLIDS
 
 
 class Room:
@@ -105,31 +111,34 @@ class Room:
 
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
-        self.landscape = textures.landscape(rng)
+        landscape = textures.landscape(rng)
         size = (HIGH - LOW)[:, 0]
         self.sides = []
-        for side, (paint, color, posters) in enumerate(WALLS):
-            wall = paint(rng, size[SIDE_AXES[side][1]], size[2], *color)
+        for (_, across, up), (paint, posters) in zip(AXES, SIDES, strict=False):
+            side = paint(rng, *textures.grid(size[across], size[up]))
             for width, height, kind, left, bottom in posters:
                 picture = textures.poster(rng, width, height, kind)
                 y, x = (round(metres * textures.TEXELS_PER_METRE) for metres in (bottom, left))
-                wall[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
-            self.sides.append(wall)
-        self.sides.append(textures.wood_tiles(rng, size[0], size[1]))
-        self.sides.append(textures.plaster(rng, size[0], size[1], (0.92, 0.92, 0.90)))
+                side[y : y + picture.shape[0], x : x + picture.shape[1]] = picture
+            self.sides.append(side)
         for side, texture in enumerate(self.sides):
             texture *= textures.resize(self._light_map(side, rng), *texture.shape[:2])
             np.clip(texture, 0, 1, out=texture)
         x, y = textures.grid(size[0], size[1]) + LOW[:2, :, None]
         self.sides[5][(x > LAMP[0]) & (x < LAMP[1]) & (y > LAMP[2]) & (y < LAMP[3])] = 1.0
-        self.box_texture = textures.poster(rng, 1.0, 1.0, "noise") * 0.8
-        textures.print_text(rng, self.box_texture, 0.12, 0.12)
-        self.plinth_texture = textures.poster(rng, 0.6, 0.44, "bars")
+        self.sides.append(landscape)
+        box = textures.poster(rng, 1.0, 1.0, "noise") * 0.8
+        textures.print_text(rng, box, 0.12, 0.12)
+        self.textures = {"box": box, "plinth": textures.poster(rng, 0.6, 0.44, "bars")}
 
     def _light_map(self, side: int, rng: np.random.Generator, n: int = 96, samples: int = 48) -> Image:
         """Compute the light map [n, n, 3] of one side of the room: ambient light and the lamp with soft shadows."""
         v, u = np.meshgrid(*[(np.arange(n, dtype=np.float32) + 0.5) / n] * 2, indexing="ij")
-        p, normal = _side_points(side, u.ravel(), v.ravel())
+        axes, u = list(AXES[side]), 1 - u if side in MIRRORED else u
+        share, normal = np.empty((3, n * n), np.float32), np.zeros((3, 1), np.float32)
+        share[axes] = [np.full(n * n, side % 2), u.ravel(), v.ravel()]
+        normal[axes[0]] = 1 - 2 * (side % 2)  # inwards
+        p = LOW + share * (HIGH - LOW) + np.float32(1e-3) * normal
         ambient, light = np.ones(n * n, np.float32), np.zeros(n * n, np.float32)
         for a in np.flatnonzero(normal == 0):  # darker towards the room's edges
             for edge in (LOW[a], HIGH[a]):
@@ -140,144 +149,93 @@ class Room:
             d = np.array([[lx], [ly], [HIGH[2, 0] - np.float32(0.01)]], np.float32) - p
             r2 = _dot(d, d) + np.float32(1e-4)
             cosine, lamp_cosine = (np.maximum(x, 0) / np.sqrt(r2) for x in (_dot(d, normal), d[2]))
-            blocked = RoomHits(np.ones_like(r2), *np.zeros((2, n * n), np.int8))
-            self._objects(p, d, blocked)
-            light += cosine * (0.35 + 0.65 * lamp_cosine) / (1 + 0.12 * r2) * (blocked.t >= np.float32(0.999))
+            t, _ = _nearer(p, d, np.ones_like(r2), np.zeros(n * n, np.int8))
+            light += cosine * (0.35 + 0.65 * lamp_cosine) / (1 + 0.12 * r2) * (t >= np.float32(0.999))
         total = 0.42 * ambient + 1.05 * light / samples
         warm = np.array([1.03, 1.0, 0.95], np.float32)
         return (total[:, None] * warm).reshape(n, n, 3).astype(np.float32)
 
-    def _objects(self, o: Image, d: Image, hits: RoomHits) -> None:
-        """Shorten the hits of rays, [3, n] both, that meet an object."""
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            inverse = np.float32(1) / d
-            for surface, (centre, radius, *_) in BALLS.items():
-                index = hits.candidates(o, inverse, centre - np.float32(radius), centre + np.float32(radius))
-                hits.shorten(index, *_round(o[:, index], d[:, index], centre, radius), surface)
-            index = hits.candidates(o, inverse, BOX_CENTRE - BOX_REACH, BOX_CENTRE + BOX_REACH)
-            oo, dd = _turned(o[:, index] - BOX_CENTRE), _turned(d[:, index])
-            near, far = _slab(oo, np.float32(1) / dd, -BOX_HALF, BOX_HALF)
-            hits.shorten(index, near, near < far, BOX)
-            index = hits.candidates(o, inverse, *PLINTH)
-            hits.shorten(index, _slab(o[:, index], inverse[:, index], *PLINTH)[0], True, PLINTH_ID)
-            for part, (x, y, radius, height) in enumerate(POLES):
-                centre, reach = (
-                    np.array([[x], [y], [height / 2]], np.float32),
-                    np.array([[radius], [radius], [height / 2]], np.float32),
-                )
-                index = hits.candidates(o, inverse, centre - reach, centre + reach)
-                oo, dd = o[:, index], d[:, index]
-                t, meets = _round(oo[:2], dd[:2], centre[:2], radius)
-                z = oo[2] + t * dd[2]
-                hits.shorten(index, t, meets & (z > 0) & (z < height), POLE, part)
-            for parts in (range(UPRIGHTS + RUNGS), range(UPRIGHTS + RUNGS, len(BARS_LOW))):
-                index = hits.candidates(o, inverse, BARS_LOW[parts].min(0), BARS_HIGH[parts].max(0))
-                oo, ii = o[:, index], inverse[:, index]
-                for part in parts:
-                    near, far = _slab(oo, ii, BARS_LOW[part], BARS_HIGH[part])
-                    hits.shorten(index, near, near < far, BARS, part)
-
-    def hit(self, o: Image, d: Image) -> RoomHits:
-        """Compute the first hits of rays that start inside the room."""
+    def hit(self, o: Image, d: Image) -> tuple[Image, np.ndarray]:
+        """Compute t and surface of the first hits of rays that start inside the room."""
         o = np.broadcast_to(o, d.shape)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             exits = np.where(d == 0, np.float32(1e9), (np.where(d > 0, HIGH, LOW) - o) / d)
         axis, t = exits.argmin(0), exits.min(0)
         surface = (2 * axis + (np.choose(axis, d) > 0)).astype(np.int8)
-        hits = RoomHits(t, surface, np.zeros_like(surface))
         x, z = o[0] + t * d[0], o[2] + t * d[2]
         through = (x > WINDOW[0]) & (x < WINDOW[1]) & (z > WINDOW[2]) & (z < WINDOW[3])
         outside = np.flatnonzero((surface == 3) & through)
-        t[outside], surface[outside] = (np.float32(OUTSIDE_Y) - o[1, outside]) / d[1, outside], LANDSCAPE
-        self._objects(o, d, hits)
-        return hits
+        t[outside], surface[outside] = (OUTSIDE[0][1] - o[1, outside]) / d[1, outside], LANDSCAPE
+        return _nearer(o, d, t, surface)
 
-    def color(self, o: Image, d: Image, hits: RoomHits, mirrors: bool = True) -> Image:
+    def color(self, o: Image, d: Image, mirrors: bool = True) -> Image:
         """Compute colors [n, 3] of rays with unit directions; `mirrors`: trace one reflection on glossy surfaces."""
-        result = np.zeros((hits.t.shape[0], 3), np.float32)
-        points = o + hits.t * d
-        for surface in np.unique(hits.surface):
-            index = np.flatnonzero(hits.surface == surface)
+        t, surfaces = self.hit(o, d)
+        result, points = np.zeros((len(t), 3), np.float32), o + t * d
+        for surface in np.unique(surfaces).tolist():
+            index = np.flatnonzero(surfaces == surface)
             p = points.take(index, 1)
-            if surface < 6:
-                result[index] = textures.lookup(self.sides[surface], *_side_uv(int(surface), p))
-            elif surface == LANDSCAPE:
-                u = (p[0] - np.float32(OUTSIDE[0])) / np.float32(OUTSIDE[1] - OUTSIDE[0])
-                v = (p[2] - np.float32(OUTSIDE[2])) / np.float32(OUTSIDE[3] - OUTSIDE[2])
-                result[index] = textures.lookup(self.landscape, u, v)
+            if surface < FIRST:
+                low, high = OUTSIDE if surface == LANDSCAPE else (LOW, HIGH)
+                _, *axes = AXES[surface]
+                u, v = ((p[axis] - low[axis]) / (high[axis] - low[axis]) for axis in axes)
+                result[index] = textures.lookup(self.sides[surface], 1 - u if surface in MIRRORED else u, v)
             else:
-                result[index] = self._object_color(int(surface), hits.part[index], p, d.take(index, 1), mirrors)
+                result[index] = self._solid_color(SOLIDS[surface - FIRST], p, d.take(index, 1), mirrors)
         return result
 
-    def _object_color(self, surface: int, part: np.ndarray, p: Image, d: Image, mirrors: bool) -> Image:
-        """Compute colors [n, 3] of points p [3, n] on one object, viewed along d [3, n]."""
-        gloss = 0.0
-        if surface in BALLS:
-            centre, radius, rgb, gloss = BALLS[surface]
-            normal, base = (p - centre) / np.float32(radius), np.array(rgb, np.float32)
-        elif surface == BOX:
-            normal, u, v = _face(_turned(p - BOX_CENTRE), -BOX_HALF, BOX_HALF)
-            normal = _turned(normal, -BOX_SIN)
-            base, gloss = textures.lookup(self.box_texture, u, v), 0.10
-        elif surface == PLINTH_ID:
-            normal, u, v = _face(p, *PLINTH)
-            base = textures.lookup(self.plinth_texture, u, v)
-        elif surface == BARS:
-            normal, _, _ = _face(p, BARS_LOW[part, :, 0].T, BARS_HIGH[part, :, 0].T)
-            brass, black, white = [0.75, 0.60, 0.20], [0.12] * 3, [0.92, 0.92, 0.90]
-            base = np.array([brass] * UPRIGHTS + [black] * RUNGS + [white] * 2, np.float32)[part]
+    def _solid_color(self, solid: Solid, p: Image, d: Image, mirrors: bool) -> Image:
+        """Compute colors [n, 3] of points p [3, n] on a solid, viewed along d [3, n]."""
+        normal, u, v = solid.normals(p)
+        if solid.color == "stripes":
+            base = np.array([[0.85, 0.20, 0.15], [0.85, 0.85, 0.82]], np.float32)[(p[2] * 8).astype(int) % 2]
+        elif isinstance(solid.color, str):
+            base = textures.lookup(self.textures[solid.color], u, v)
         else:
-            x, y, radius, _ = (np.array(column, np.float32)[part] for column in zip(*POLES, strict=True))
-            normal = np.stack([(p[0] - x) / radius, (p[1] - y) / radius, 0 * radius])
-            stripe = ((p[2] * np.float32(8)).astype(np.int32) % 2 == 0) & (part == 0)
-            base = np.where(
-                stripe[:, None], np.array([0.85, 0.20, 0.15], np.float32), np.array([0.85, 0.85, 0.82], np.float32)
-            )
+            base = np.array(solid.color, np.float32)
         light = np.array([[(LAMP[0] + LAMP[1]) / 2], [(LAMP[2] + LAMP[3]) / 2], HIGH[2]], np.float32) - p
         distance = np.sqrt(_dot(light, light))
         lit = np.maximum(_dot(light, normal) / distance, 0) / (1 + 0.12 * distance * distance)
         low = 1 - 0.35 * np.exp(-p[2] / np.float32(0.15))  # ambient occlusion by the floor
         result = base * ((0.42 + 0.10 * normal[2]) * low + 0.95 * lit)[:, None]
-        if gloss:
+        if solid.gloss:
             facing = -_dot(d, normal)
-            fresnel = gloss + (1 - gloss) * np.clip(1 - facing, 0, 1) ** 5
-            r, seen = d + 2 * facing * normal, np.float32(0.4)
-            if mirrors:
-                start = p + np.float32(1e-3) * normal
-                seen = self.color(start, r, self.hit(start, r), mirrors=False)
+            fresnel = solid.gloss + (1 - solid.gloss) * np.clip(1 - facing, 0, 1) ** 5
+            r = d + 2 * facing * normal
+            seen = self.color(p + np.float32(1e-3) * normal, r, mirrors=False) if mirrors else np.float32(0.4)
             highlight = np.maximum(_dot(r, light) / distance, 0) ** 90
             result = result * (1 - fresnel)[:, None] + seen * fresnel[:, None] + 0.5 * highlight[:, None]
         return np.clip(result, 0, 1).astype(np.float32)
 
 
-def _turned(v: Image, sine: np.float32 = BOX_SIN) -> Image:
-    """Rotate from world axes to the box's; with the negative sine back."""
-    return np.stack([BOX_COS * v[0] + sine * v[1], BOX_COS * v[1] - sine * v[0], v[2]])
+def _nearer(o: Image, d: Image, t: Image, surfaces: np.ndarray) -> tuple[Image, np.ndarray]:
+    """Replace, in place, t and surfaces of rays that meet a solid before."""
+    number = FIRST
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        inverse = np.float32(1) / d
+        for group in GROUPS:
+            low, high = ([s.center + sign * s.reach for s in group] for sign in (-1, 1))
+            near, far = _slab(o, inverse, np.min(low, 0), np.max(high, 0))
+            index = np.flatnonzero((near < far) & (far > NEAR) & (near < t))
+            rays = o[:, index], d[:, index], inverse[:, index]
+            for solid in group:
+                enters, meets = solid.enter(*rays)
+                nearer = meets & (enters > NEAR) & (enters < t[index])
+                t[index[nearer]], surfaces[index[nearer]] = enters[nearer], number
+                number += 1
+    return t, surfaces
 
 
-def _face(p: Image, low: np.ndarray, high: np.ndarray) -> tuple[Image, Image, Image]:
-    """Compute outward normals [3, n] and face coordinates u, v in [0, 1] of points on boxes."""
-    ratio = (p - (low + high) / 2) / ((high - low) / 2)
-    axis = np.abs(ratio).argmax(0)
-    normal = np.where(axis == [[0], [1], [2]], np.sign(ratio), 0).astype(np.float32)
-    u = np.where(axis == 0, ratio[1], ratio[0]) * np.float32(0.5) + np.float32(0.5)
-    v = np.where(axis == 2, ratio[1], ratio[2]) * np.float32(0.5) + np.float32(0.5)
-    return normal, u, v
+def _dot(a: Image, b: Image) -> Image:
+    return (a * b).sum(0)
 
 
-def _side_uv(side: int, p: Image) -> tuple[Image, Image]:
-    """Compute texture coordinates in [0, 1]; u points right for a viewer inside the room."""
-    _, ua, va = SIDE_AXES[side]
-    u, v = ((p[a] - LOW[a]) / (HIGH[a] - LOW[a]) for a in (ua, va))
-    return 1 - u if side in (1, 2) else u, v
+def _slab(o: Image, inverse: Image, low: Image, high: Image) -> tuple[Image, Image]:
+    """Compute entry and exit t of rays through an axis-aligned box."""
+    t0, t1 = (low - o) * inverse, (high - o) * inverse
+    return np.minimum(t0, t1).max(0), np.maximum(t0, t1).min(0)
 
 
-def _side_points(side: int, u: Image, v: Image) -> tuple[Image, np.ndarray]:
-    """Compute world points [3, n] at texture coordinates, and the side's inward normal [3, 1]."""
-    na, ua, va = SIDE_AXES[side]
-    wall, inward = (LOW, 1.0) if side % 2 == 0 else (HIGH, -1.0)
-    p, normal = np.empty((3, len(u)), np.float32), np.zeros((3, 1), np.float32)
-    p[ua] = LOW[ua] + (1 - u if side in (1, 2) else u) * (HIGH[ua] - LOW[ua])
-    p[va] = LOW[va] + v * (HIGH[va] - LOW[va])
-    p[na], normal[na] = wall[na] + np.float32(1e-3 * inward), inward
-    return p, normal
+def _turned(v: Image, sine: np.float32 = YAW_SIN) -> Image:
+    """Rotate from world axes to a turned box's; with the negative sine back."""
+    return np.stack([YAW_COS * v[0] + sine * v[1], YAW_COS * v[1] - sine * v[0], v[2]])

@@ -1,6 +1,7 @@
 """Procedural textures of the sample room, generated once as images and sampled bilinearly.
 
-A texture is float32 [h, w, 3] in [0, 1]. Row 0 is v = 0 and column 0 is u = 0, both at the texel's centre.
+A texture is float32 [h, w, 3] in [0, 1]. Row 0 is v = 0 and column 0 is u = 0, both at the texel's centre. Painters of
+sides take coordinates x and y [h, w] in metres.
 """
 
 import numpy as np
@@ -58,9 +59,9 @@ def mix(a: Image | tuple[float, ...], b: Image | tuple[float, ...], t: Image) ->
     return a + (b - a) * t[..., None]
 
 
-def wood_tiles(rng: np.random.Generator, width_m: float, height_m: float, tile: float = 0.5) -> Image:
+def wood_tiles(rng: np.random.Generator, x: Image, y: Image) -> Image:
     """Paint square wooden tiles, light and dark like a chessboard, with alternating grain direction."""
-    x, y = grid(width_m, height_m)
+    tile = 0.5
     i, j = (x / tile).astype(int), (y / tile).astype(int)
     odd = (i + j) % 2 == 1
     along, across = np.where(odd, y, x), np.where(odd, x, y)
@@ -75,9 +76,8 @@ def wood_tiles(rng: np.random.Generator, width_m: float, height_m: float, tile: 
     return color.astype(np.float32)
 
 
-def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
+def bricks(rng: np.random.Generator, x: Image, y: Image) -> Image:
     """Paint bricks of 25 by 9 cm in light mortar."""
-    x, y = grid(width_m, height_m)
     row = (y / 0.09).astype(int)
     shifted = x + 0.125 * (row % 2)
     column = (shifted / 0.25).astype(int)
@@ -88,20 +88,16 @@ def bricks(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
     return np.where(mortar[..., None], (0.70 + 0.2 * speckle)[..., None], color).astype(np.float32)
 
 
-def plaster(rng: np.random.Generator, width_m: float, height_m: float, color: tuple[float, float, float]) -> Image:
-    x, _ = grid(width_m, height_m)
+def plaster(rng: np.random.Generator, x: Image, _: Image, color: tuple[float, float, float]) -> Image:
     coarse, fine = noise(rng, x.shape, (6, 8)), noise(rng, x.shape, (80, 100), 3)
     return (np.asarray(color, np.float32) * (0.78 + 0.18 * coarse + 0.3 * (fine - 0.35))[..., None]).clip(0, 1)
 
 
-def wallpaper(rng: np.random.Generator, width_m: float, height_m: float) -> Image:
+def wallpaper(rng: np.random.Generator, x: Image, y: Image) -> Image:
     """Paint stripes with small diamonds."""
-    x, y = grid(width_m, height_m)
     stripe = (x / 0.16).astype(int) % 2 == 0
     diamond = np.abs((x % 0.16) - 0.08) + np.abs((y % 0.12) - 0.06) < 0.035
-    color = np.where(
-        stripe[..., None], np.array([0.30, 0.48, 0.50], np.float32), np.array([0.78, 0.76, 0.64], np.float32)
-    )
+    color = np.array([[0.78, 0.76, 0.64], [0.30, 0.48, 0.50]], np.float32)[stripe.astype(int)]
     color[diamond] = np.where(stripe[diamond, None], (0.92, 0.80, 0.42), (0.55, 0.25, 0.28))
     return (color * (0.9 + 0.2 * noise(rng, x.shape, (30, 60), 3))[..., None]).clip(0, 1)
 

@@ -49,8 +49,8 @@ def room_of_tests() -> Room:
 def shaded(rays: np.ndarray, centre: tuple[float, float, float]) -> np.ndarray:
     room, flat = room_of_tests(), rays.reshape(-1, 3).astype(np.float32)
     origin, direction = np.float32(centre)[:, None], np.ascontiguousarray(flat.T)
-    colours = room.color(origin, direction, room.hit(origin, direction))
-    return np.uint8(np.clip(colours, 0.0, 1.0) * 255.0 + 0.5).reshape(rays.shape)
+    colors = room.color(origin, direction)
+    return np.uint8(np.clip(colors, 0.0, 1.0) * 255.0 + 0.5).reshape(rays.shape)
 
 
 def grey(pixels: np.ndarray) -> np.ndarray:

@@ -9,7 +9,8 @@ from PIL import Image
 
 from bitymi_ns.sample import generate
 from bitymi_ns.sample.capture import camera_path, first_hits, look_at
-from bitymi_ns.sample.room import BALLS, HIGH, LANDSCAPE, LOW, SPHERE, Room
+from bitymi_ns.sample.room import FIRST as SPHERE
+from bitymi_ns.sample.room import HIGH, LANDSCAPE, LOW, SOLIDS, Room
 
 VIEWS, WIDTH, HEIGHT = 12, 160, 120
 
@@ -55,10 +56,10 @@ def project(meta: dict, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.
         return meta["cx"] + meta["fl_x"] * p[:, 0] / depth, meta["cy"] - meta["fl_y"] * p[:, 1] / depth, depth
 
 
-def test_points_have_the_colour_of_the_pixels_they_fall_on(
+def test_points_have_the_color_of_the_pixels_they_fall_on(
     meta: dict, images: np.ndarray, cloud: tuple[np.ndarray, np.ndarray]
 ) -> None:
-    points, colours = cloud
+    points, colors = cloud
     room, path = Room(0), camera_path(VIEWS, WIDTH, HEIGHT, 0)
     agree, total = 0, 0
     for k in range(VIEWS):
@@ -66,15 +67,15 @@ def test_points_have_the_colour_of_the_pixels_they_fall_on(
         index = np.flatnonzero((depth > 0) & (x >= 1) & (x < WIDTH - 1) & (y >= 1) & (y < HEIGHT - 1))
         x, y = x[index], y[index]
         flat = y.astype(int) * WIDTH + x.astype(int)
-        seen, hits = first_hits(room, path[k], flat)
+        seen, _, surfaces = first_hits(room, path[k], flat)
         near = np.linalg.norm(seen - points[index], axis=1) < 0.03 * depth[index]
-        plain = near & (hits.surface != SPHERE)
+        plain = near & (surfaces != SPHERE)
         # 3 x 3 pixels, as a point may fall on the edge of a pattern
         best = np.full(len(index), np.inf)
         for dy in (-1, 0, 1):
             for dx in (-1, 0, 1):
                 pixel = images[k][y.astype(int) + dy, x.astype(int) + dx] / 255.0
-                best = np.minimum(best, np.abs(pixel - colours[index]).max(axis=1))
+                best = np.minimum(best, np.abs(pixel - colors[index]).max(axis=1))
         agree += int((best[plain] < 0.1).sum())
         total += int(plain.sum())
     assert total > 3000, "points are seen by several views"
@@ -99,25 +100,25 @@ def test_cameras_stand_in_the_room_upright_and_clear(meta: dict) -> None:
     assert np.allclose(turned, [[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     room = Room(0)
     for view in camera_path(60, 64, 48, 0):
-        _, hits = first_hits(room, view, np.arange(64 * 48))
-        assert hits.t.min() > 0.1
-    assert {LANDSCAPE, SPHERE} <= set(np.concatenate([first_hits(room, v, np.arange(3072))[1].surface for v in [view]]))
+        _, t, surfaces = first_hits(room, view, np.arange(64 * 48))
+        assert t.min() > 0.1
+    assert {LANDSCAPE, SPHERE} <= set(surfaces.tolist())
 
 
 def test_sphere_mirrors() -> None:
-    """A point of the sphere has two colours from two sides; a point of the floor has one."""
+    """A point of the sphere has two colors from two sides; a point of the floor has one."""
     room = Room(0)
 
     def seen(eye: list[float], point: np.ndarray) -> np.ndarray:
         d = point - np.array(eye)
         d = np.float32(d / np.linalg.norm(d))[:, None]
         o = np.float32(eye)[:, None]
-        return room.color(o, d, room.hit(o, d))[0]
+        return room.color(o, d)[0]
 
     a, b = [-1.5, -1.8, 1.2], [0.6, -1.9, 0.9]
     angles = np.linspace(-0.5, 1.3, 12)
-    centre, radius, *_ = BALLS[SPHERE]
-    on_sphere = centre.T + radius * np.stack([0 * angles, -np.cos(angles), np.sin(angles)], axis=1)
+    sphere = SOLIDS[0]
+    on_sphere = sphere.center.T + sphere.radius * np.stack([0 * angles, -np.cos(angles), np.sin(angles)], axis=1)
     assert np.mean([np.abs(seen(a, p) - seen(b, p)).max() for p in on_sphere]) > 0.08
     on_floor = np.array([0.3, -1.5, 0.0])
     assert np.abs(seen(a, on_floor) - seen(b, on_floor)).max() < 0.01

@@ -34,7 +34,7 @@ def room(tmp_path_factory) -> tuple[Path, list[np.ndarray]]:
     depths = []
     for frame in meta["frames"]:
         pose = np.array(frame["transform_matrix"])
-        points, _ = first_hits(model, RoomView(pose, meta["fl_x"], WIDTH, HEIGHT), np.arange(WIDTH * HEIGHT))
+        points, *_ = first_hits(model, RoomView(pose, meta["fl_x"], WIDTH, HEIGHT), np.arange(WIDTH * HEIGHT))
         depths.append(((pose[:3, 3] - points) @ pose[:3, 2]).reshape(HEIGHT, WIDTH))
     return folder, depths
 

@@ -18,7 +18,6 @@ import torch
 from PIL import ExifTags, Image
 
 from bitymi_ns.capture import exif
-from bitymi_ns.capture.colmap_model import forget_model
 from bitymi_ns.capture.depth_normal_maps import read_depth, read_normal
 from bitymi_ns.capture.lens import lenses_of
 from bitymi_ns.capture.points import read_cloud
@@ -99,7 +98,6 @@ def _colmap(work: Path, binary: bool) -> Target:
     def run(data: bytes) -> None:
         for path, part in zip(files, data.split(CUT), strict=False):
             path.write_bytes(part)
-        forget_model()
         BitymiDataParserConfig(data=room).setup().outputs  # noqa: B018
 
     whole = CUT.join(path.read_bytes() for path in files)

@@ -50,15 +50,8 @@ class Model(NamedTuple):
 
 
 def read_model(folder: Path) -> Model:
-    """Read a model; of both forms the text, as nerfstudio does, with a warning if they differ. The last model is
-    cached, because a run reads it several times. Raises CaptureError: it cannot be used; names file and entry."""
-    files = [folder / f"{name}{form}" for name in TEXT for form in (*FORMS, ".ply")]
-    stamps = tuple((file, file.stat().st_mtime_ns, file.stat().st_size) for file in files if file.is_file())
-    return _read_model(folder, stamps)
-
-
-@functools.lru_cache(maxsize=1)
-def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
+    """Read a model; of both forms the text, as nerfstudio does, with a warning if they differ. Raises CaptureError: it
+    cannot be used; names file and entry."""
     path = _file(folder, "cameras")
     cameras = dict(_parsed(path))
     _check_cameras(path, cameras)
@@ -83,9 +76,6 @@ def _read_model(folder: Path, stamps: tuple[Any, ...]) -> Model:
         (xyz, rgb), without_colors = read_cloud(cloud, "Copy it again, or move it away to have points triangulated.")
     # nerfstudio sorts paths, not text: sort alike to hold the same photographs out
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
-
-
-forget_model = _read_model.cache_clear
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
@@ -119,14 +109,12 @@ def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: 
     """Warn if a binary model beside the text that is read differs from it."""
     if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
         return
-    count = image_count(folder)  # of the binary form, if there is one
-    differences = [f"{images} images in text and {count} in binary form"] if count != images else []
-    path = folder / "cameras.bin"
-    if path.is_file() and dict(_parsed(path)) != cameras:
-        differences.append("other cameras in text than in binary form")
-    if differences:
-        advice = "To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
-        warn(f"{folder} holds two models: {' and '.join(differences)}. The text is read. {advice}")
+    count, path = image_count(folder), folder / "cameras.bin"  # of the binary form
+    if count != images or (path.is_file() and dict(_parsed(path)) != cameras):
+        warn(
+            f"{folder} holds two models, of {images} images in text and {count} in binary form, or of other cameras. "
+            "The text is read. To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
+        )
 
 
 def _parsed(path: Path) -> list[Any]:
@@ -152,11 +140,9 @@ def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
     for number, camera in cameras.items():
         count = parameter_count(camera.model)
         if not all(1 <= side <= MAX_SIDE for side in camera.size) or not np.isfinite(camera.params).all():
-            written = " ".join([*(str(side)[:20] for side in camera.size), *(f"{value:g}" for value in camera.params)])
-            needs = f"its size has to be from 1 to {MAX_SIDE:,} pixels and all numbers finite"
-            what = f"camera {number} ({camera.model} {written}) cannot be used"
-            fail(f"{path}: {what}: {needs}. Correct it, or export the model from COLMAP again.")
-        if count is not None and len(camera.params) != count:
+            what = f"{path}: camera {number}, {' '.join(str(part)[:99] for part in camera)}, cannot be used"
+            fail(f"{what}: sides are 1 to {MAX_SIDE:,} pixels, numbers finite. Correct it, or export the model again.")
+        if len(camera.params) != count:
             what = f"camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}"
             fail(f"{path}: {what}. Correct its line.")
 
@@ -168,15 +154,11 @@ def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, 
     first: dict[str, int] = {}
     for number, image in images.items():
         if image.camera_id not in cameras:
-            fail(
-                f"{path}: image {number} ({image.name}) was taken by camera {image.camera_id}, but the model has only "
-                f"{listed(sorted(cameras))}. Correct its line, or copy the whole model again."
-            )
+            what = f"image {number} ({image.name}) is of camera {image.camera_id}, but the model has only"
+            fail(f"{path}: {what} {listed(sorted(cameras))}. Correct its line, or copy the model again.")
         if not np.isfinite([*image.qvec, *image.tvec]).all() or not TINY < np.linalg.norm(image.qvec) < 1.0 / TINY:
-            fail(
-                f"{path}: the pose of image {number} ({image.name}) is not finite, or its "
-                "rotation is zero. Correct its line or remove the image."
-            )
+            what = f"the pose of image {number} ({image.name}) is not finite, or its rotation is zero"
+            fail(f"{path}: {what}. Correct its line or remove the image.")
         if first.setdefault(image.name, number) != number:
             twice = f"images {first[image.name]} and {number} are both of {image.name}"
             fail(f"{path}: {twice}. Correct the name of one of them or remove it.")

@@ -38,16 +38,12 @@ class Origin:
 class Source:
     """A COLMAP model and the photographs that belong to it."""
 
+    model: Model = field(repr=False, compare=False)
     folder: Path  # of the model
     photographs: Path  # folder to which names in the model are relative
     left_out: Mapping[str, str] = field(default_factory=dict)  # photographs that the model lacks, and known reasons
     report: Path | None = None  # folder of the report on structure from motion; None = none
     origin: Origin | None = None  # None = the capture came with the model
-
-    @property
-    def model(self) -> Model:
-        """The model; see `read_model`."""
-        return read_model(self.folder)
 
     def files(self) -> list[Path]:
         """Find the files of the model's images; for a missing one, return the path that the model names."""
@@ -72,11 +68,9 @@ def find_source(found: Found, images: Path | None, downscale: int, need_photos: 
     factor, camera = photographs.name.rpartition("_")[2], model.cameras[model.images[0].camera_id]
     size = image_size(photographs / names[0]) if need_photos and factor.isdecimal() else None
     if size is not None and size != camera.size and in_proportion(size, camera.size) and factor != str(downscale):
-        fail(
-            f"of the photographs of {found.path}, of {camera.width} x {camera.height} pixels, only copies of "
-            f"{size[0]} x {size[1]} are there, in {photographs}: `bitymi-data --downscale-factor {factor}` uses them."
-        )
-    return Source(found.path, photographs)
+        what = f"only copies of {size[0]} x {size[1]} pixels of the photographs of {found.path} are there, in"
+        fail(f"{what} {photographs}: `bitymi-data --downscale-factor {factor}` uses them.")
+    return Source(model, found.path, photographs)
 
 
 def _find_folder(
@@ -114,11 +108,9 @@ def _find_folder(
     if exact[best] == 0:
         near = [hint for each in searched if each.is_dir() and (hint := FileFinder(each).nearest(names[0], names))]
         hint = f" ({near[0]})" if near else ""
-        fail(
-            f"the COLMAP model {folder} is of {listed(names)}, which are in none of the folders of {capture}{hint}. "
-            "Copy the photographs to its folder `images`, or give their folder, seen from there: `bitymi-data "
-            "--images-path`."
-        )
+        where = f"which are in none of the folders of {capture}{hint}"
+        advice = "Copy them to its folder `images`, or give their folder: `bitymi-data --images-path`."
+        fail(f"the COLMAP model {folder} is of {listed(names)}, {where}. {advice}")
     return best
 
 

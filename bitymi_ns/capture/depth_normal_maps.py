@@ -126,11 +126,9 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
         if alike and not in_proportion(size, photograph):
             fail(wrong_size(path, size, photograph))
         if max(size[0] / photograph[0], size[1] / photograph[1]) > MOST_LARGER or math.prod(shape) > MOST_NUMBERS:
-            fail(
-                f"{path} declares {' x '.join(map(str, shape))} numbers for a photograph of {photograph[0]} x "
-                f"{photograph[1]} pixels: at most {MOST_LARGER} times its sides, and {MOST_NUMBERS:,}, are read. "
-                f"{_WITHOUT}"
-            )
+            declares = f"{path} declares {' x '.join(map(str, shape))} numbers for a photograph of"
+            limits = f"at most {MOST_LARGER} times its sides, and {MOST_NUMBERS:,} numbers, are read"
+            fail(f"{declares} {photograph[0]} x {photograph[1]} pixels: {limits}. {_WITHOUT}")
 
     with parsing(path, _WITHOUT):
         if path.suffix.lower() in (".npy", ".npz"):

@@ -57,11 +57,11 @@ class FileFinder:
 
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
         """Find the files of several names. A file that fits several is that of its exact name, or of none."""
-        found = [self.find(name) for name in names]
-        exact = [self.folder / name == path for name, path in zip(names, found, strict=True)]
-        users, sure = Counter(found), Counter(path for path, same in zip(found, exact, strict=True) if same)
-        unique = [users[path] == 1 or (same and sure[path] == 1) for path, same in zip(found, exact, strict=True)]
-        return [path if alone else None for path, alone in zip(found, unique, strict=True)]
+        files = [self.find(name) for name in names]
+        exact = [path if self.folder / name == path else None for name, path in zip(names, files, strict=True)]
+        users, sure = Counter(files), Counter(exact)
+        return [path if users[path] == 1 or (same and sure[path] == 1) else None
+                for path, same in zip(files, exact, strict=True)]  # fmt: skip
 
     def missing(self, name: str) -> Path:
         """Return a path to show for a missing file."""
@@ -77,8 +77,8 @@ class FileFinder:
 
     def nearest(self, name: str, taken: Iterable[str] = ()) -> str:
         """Describe a file of a similar name that is not of the names `taken`, as "but there is ..."; empty = none."""
-        wanted, others = folded(name)[-1:], {folded(each)[-1:] for each in taken}
-        last = {parts[-1]: files[0] for parts, files in self._whole.items() if parts[-1:] not in others}
+        wanted, used = folded(name)[-1:], {folded(path)[-1:] for path in taken}
+        last = {parts[-1]: files[0] for parts, files in self._whole.items() if parts[-1:] not in used}
         near = difflib.get_close_matches(wanted[0] if wanted else "", last, n=1, cutoff=0.8)
         if not near:
             return ""
@@ -119,11 +119,9 @@ def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
     missing = [file for file in names if not os.path.isfile(file)]
     if not missing:
         return
-    some = "\n  ".join(f"{file}{_hint(source.parent, file, names)}" for file in missing[:3])
-    fail(
-        f"{len(missing)} of {len(names)} photographs of {source} are missing:\n  {some}\n"
-        f"Copy them there, correct the names or remove the frames.{smaller_copies(missing)}"
-    )
+    shown = "\n  ".join(f"{file}{_hint(source.parent, file, names)}" for file in missing[:3])
+    advice = f"Copy them there, correct the names or remove the frames.{smaller_copies(missing)}"
+    fail(f"{len(missing)} of {len(names)} photographs of {source} are missing:\n  {shown}\n{advice}")
 
 
 def smaller_copies(files: Iterable[Path]) -> str:
@@ -141,8 +139,8 @@ def name_unused(found: Found, used: Iterable[Path | None], masks: Iterable[Path 
     named, masked = ({Path(os.path.normpath(path)) for path in some if path is not None} for some in (used, masks))
     folder, copies = Path(os.path.normpath(found.folder)), None if downscale is None else f"_{downscale}"
     models = {images: model for model in models_in(folder) for images in images_of(folder / model)}
-    if others := passed_over(folder, named, copies, masked, models):
-        say(f"Not taken for photographs in {found.folder}: {listed(others, most=12)}.")
+    if left := passed_over(folder, named, copies, masked, models):
+        say(f"Not taken for photographs in {found.folder}: {listed(left, most=12)}.")
 
 
 def _hint(folder: Path, file: Path, named: Sequence[Path]) -> str:
@@ -162,13 +160,10 @@ def report_renamed(source: str, names: Sequence[str], files: Sequence[Path], fol
         plain = Path(os.path.normpath(folder / name.replace("\\", "/")))
         return os.path.normpath(file) in (str(plain), f"{plain}{file.suffix}")
 
-    other = [
-        f"{file.relative_to(folder).as_posix()} for {name}"
-        for name, file in zip(names, files, strict=True)
-        if file.is_relative_to(folder) and not is_usual(name, file)
-    ]
-    if other:
-        say(f"{source}: {len(other)} of {len(names)} photographs have other names than it says: {listed(other)}.")
+    renamed = [f"{file.relative_to(folder).as_posix()} for {name}" for name, file in zip(names, files, strict=True)
+               if file.is_relative_to(folder) and not is_usual(name, file)]  # fmt: skip
+    if renamed:
+        say(f"{source}: {len(renamed)} of {len(names)} photographs have other names than it says: {listed(renamed)}.")
 
 
 def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:
@@ -185,16 +180,16 @@ def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> lis
     """Find the photographs that a file names; missing ones keep their names. Fail if a name fits several files."""
     folder = path.parent
     finder = FileFinder(folder, outside=True)
-    found = finder.find_all(names)
-    if need_photos and None in found and (folder / "images").is_dir():
-        taken = set(found)
+    files = finder.find_all(names)
+    if need_photos and None in files and (folder / "images").is_dir():
+        taken = set(files)
         images = FileFinder(folder / "images").find_all(names)
-        found = [one or (other if other not in taken else None) for one, other in zip(found, images, strict=True)]
-    for i, (name, file) in enumerate(zip(names, found, strict=True)):
+        files = [file or (None if image in taken else image) for file, image in zip(files, images, strict=True)]
+    for i, (name, file) in enumerate(zip(names, files, strict=True)):
         ambiguous = finder.ambiguous(name) if need_photos and file is None else []
         if ambiguous:
             fail(f"{path}: frame {i} is of {name}, but there are {listed(ambiguous)}. Write the right one's ending.")
-    return [Path(os.path.normpath(file or folder / name)) for name, file in zip(names, found, strict=True)]
+    return [Path(os.path.normpath(file or folder / name)) for name, file in zip(names, files, strict=True)]
 
 
 def find_masks(
@@ -202,60 +197,50 @@ def find_masks(
 ) -> list[Path | None]:
     """Find masks, which photographs may share, by name; missing ones keep their stated names."""
     finder = FileFinder(folder, outside=True)
-    found = {name: finder.find(name) if need_photos else None for name in dict.fromkeys(names) if name is not None}
-    taken = set(photographs)
-    paths = {name: folder / name if path is None or path in taken else path for name, path in found.items()}
-    return [None if name is None else paths[name] for name in names]
+    taken = {None, *photographs}
+    files = {name: finder.find(name) if need_photos else None for name in dict.fromkeys(names) if name is not None}
+    return [None if name is None else folder / name if files[name] in taken else files[name] for name in names]
 
 
 def find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -> list[MapFiles]:
     """Find maps of depth and normals; warn of missing ones."""
     finder = FileFinder(path.parent, outside=True, extensions=MAP_FILES)
-    found: dict[str, list[Path | None]] = {}
+    files: dict[str, list[Path | None]] = {}
     for key in ("depth_file_path", "normal_file_path"):
         names = [frame.get(key) for frame in frames]
-        found[key] = [None if name is None else finder.find(name) for name in names]
-        lacking = [name for name, file in zip(names, found[key], strict=True) if name is not None and file is None]
+        files[key] = [None if name is None else finder.find(name) for name in names]
+        lacking = [name for name, file in zip(names, files[key], strict=True) if name is not None and file is None]
         if lacking and need_photos:
             warn(f"{path}: {len(lacking)} files of {key} are missing, and not used: {listed(lacking)}.")
-    return [MapFiles(depth, normal=normal) for depth, normal in zip(*found.values(), strict=True)]
+    return [MapFiles(depth, normal=normal) for depth, normal in zip(*files.values(), strict=True)]
 
 
 def find_named(names: Sequence[Path], wanted: Sequence[str], source: str, any_folder: bool = False) -> list[int]:
     """Find photographs by names that may differ in case, Unicode form, extension and (`any_folder`) leading folders."""
-    forms: list[Callable[[str], tuple[str, ...]]] = [
+    forms: list[Callable[[str], Parts]] = [
         lambda name: PurePath(name.replace("\\", "/")).parts,
         folded,
         lambda name: without_extension(folded(name) or ("",)),
     ]
-    whole = [[form(str(name)) for name in names] for form in forms]
-    tables: list[dict[str, list[int]]] = [defaultdict(list) for _ in forms]
-    for table, keys in zip(tables, whole, strict=True):
-        for i, key in enumerate(keys):
-            table[key[-1]].append(i)
-
-    def fit(name: str) -> list[int]:
-        for form, table, keys in zip(forms, tables, whole, strict=True):
-            parts = form(name)
-            for start in range(len(parts) if any_folder else min(1, len(parts))):
-                tail = parts[start:]
-                fitting = [i for i in table.get(tail[-1], []) if keys[i][-len(tail) :] == tail]
-                if fitting:
-                    return fitting
-        return []
-
-    unknown, found = [], []
+    tables: list[dict[Parts, list[int]]] = [defaultdict(list) for _ in forms]  # photographs by ends of their names
+    for form, table in zip(forms, tables, strict=True):
+        for i, parts in enumerate(form(str(name)) for name in names):
+            for start in range(len(parts)):
+                table[parts[start:]].append(i)
+    unknown, indices = [], []
     for name in wanted:
-        fitting = fit(name)
+        tails = ((table, form(name)) for form, table in zip(forms, tables, strict=True))
+        ends = ((table, parts[k:]) for table, parts in tails for k in range(len(parts) if any_folder else 1))
+        fitting = next(filter(None, (table.get(parts) for table, parts in ends)), [])
         if len(fitting) > 1:
             several = f"{len(fitting)} photographs, {listed([names[i] for i in fitting])}"
             fail(f"{source}: {name} is the name of {several}. Give its folder, too.")
-        found += fitting
+        indices += fitting
         unknown += [] if fitting else [name]
     if unknown:
         which = f"{listed(unknown)}. Its photographs are {listed(told_apart(names))}."
         fail(f"{source}: {len(unknown)} of {len(wanted)} names are of no photograph of the capture: {which}")
-    return found
+    return indices
 
 
 def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> list[Photograph]:
@@ -270,19 +255,18 @@ def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> l
         return [folder.joinpath(f"{inside[0]}_{downscale}", *inside[1:]), *([flat] if inside[0] == "images" else [])]
 
     def mask_copy(mask: Path | None) -> Path | None:
-        small = None if mask is None else folder / f"masks_{downscale}" / mask.name
-        return small if small is not None and os.path.isfile(small) else mask
+        copy = None if mask is None else folder / f"masks_{downscale}" / mask.name
+        return copy if copy is not None and os.path.isfile(copy) else mask
 
-    found = [next((copy for copy in copies(each.file) if os.path.isfile(copy)), None) for each in photographs]
-    if not any(found):
+    files = [each.file for each in photographs]
+    small = [next(filter(os.path.isfile, copies(file)), copies(file)[0]) for file in files]  # some may be missing
+    if not any(map(os.path.isfile, small)):
         return photographs
-    found = [copy or copies(each.file)[0] for each, copy in zip(photographs, found, strict=True)]  # some are missing
-    if len(set(found)) < len(set(each.file for each in photographs)):
-        twins = sorted({each.file.relative_to(folder).as_posix() for each, copy in zip(photographs, found, strict=True)
-                        if found.count(copy) > 1})  # fmt: skip
-        fail(
-            f"{listed(twins)} have the same names in different folders, but {found[0].parent} can have one of each "
-            "alone. Use the photographs as they are (`bitymi-data --downscale-factor 1`), or give them different names."
-        )
+    if len(set(small)) < len(set(files)):
+        uses = Counter(small)
+        twins = sorted({file.relative_to(folder).as_posix() for file, copy in zip(files, small, strict=True)
+                        if uses[copy] > 1})  # fmt: skip
+        where = f"have the same names in different folders, but {small[0].parent} can have one of each alone"
+        fail(f"{listed(twins)} {where}. Use `bitymi-data --downscale-factor 1`, or give them different names.")
     return [replace(each, file=copy, mask=mask_copy(each.mask), downscaled=True)
-            for each, copy in zip(photographs, found, strict=True)]  # fmt: skip
+            for each, copy in zip(photographs, small, strict=True)]  # fmt: skip

@@ -1,12 +1,14 @@
 """World frame of a model: z up by gravity, GPS or the cameras; metric scale by GPS."""
 
 import json
-import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, TypeAdapter
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture import pycolmap
@@ -20,7 +22,6 @@ AGREEMENTS = (1.0, 2.5, GPS_ERROR, 2 * GPS_ERROR)  # distances in metres within 
 SAME_SHAPE = 0.5  # largest error of an alignment, relative to the spread
 FILE = "frame.json"  # beside the report
 UP = (0.0, 0.0, 1.0)  # up in the world frame
-SOURCES = ("gps", "gravity", "cameras")
 SAME_UP = np.cos(np.radians(10.0))  # cosine of the largest angle between equal up directions
 STEEPEST = np.cos(np.radians(45.0))  # cosine of the largest tilt of GPS positions against gravity; else ignore gravity
 
@@ -29,8 +30,8 @@ STEEPEST = np.cos(np.radians(45.0))  # cosine of the largest tilt of GPS positio
 class WorldFrame:
     """Relation of a model's world to the real one."""
 
-    up: str  # source of up (+z), one of SOURCES
-    metres_per_unit: float | None  # 1 with scale by GPS; None = unknown
+    up: Literal["gps", "gravity", "cameras"]  # source of up (+z)
+    metres_per_unit: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None  # 1 with scale by GPS; None = unknown
     gps_origin: tuple[float, float, float] | None
     """Latitude, longitude (degrees) and altitude (metres) of the origin, x east and y north there."""
     gps_error: float | None  # median distance of cameras from GPS positions that agree, metres
@@ -45,13 +46,9 @@ def write_frame(folder: Path, frame: WorldFrame) -> None:
 
 def read_frame(folder: Path) -> WorldFrame | None:
     """Read frame.json in a folder; None = none, or another program's."""
-    try:
-        frame = WorldFrame(**read_json(folder / FILE))
-    except (OSError, ValueError, TypeError):
-        return None
-    length = frame.metres_per_unit
-    known = length is None or (isinstance(length, (int, float)) and 0 < length < math.inf)
-    return frame if known and frame.up in SOURCES else None
+    with suppress(OSError, ValueError):
+        return TypeAdapter(WorldFrame).validate_python(read_json(folder / FILE))
+    return None
 
 
 def gps_line(folder: Path) -> str:

@@ -17,6 +17,7 @@ from PIL import Image
 
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, wrong_size
 from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say
+from bitymi_ns.trust import listed
 
 MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
 NODE_STEP = 4  # pixels between the nodes of the distortion; interpolating between them is far more exact than a pixel
@@ -168,17 +169,13 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list
     camera = colmap.colmap
     if camera.is_spherical():
         if not is_full_sphere(width, height):
-            fail(
-                f"{label} is {model}, but its photographs have {width} x {height} pixels: pictures of all directions "
-                "are twice as wide as high. Correct the camera model, or pad the photographs to that shape."
-            )
+            what = f"{label} is {model}, which is twice as wide as high, but its photographs have {width} x {height}"
+            fail(f"{what} pixels. Correct the camera model, or pad the photographs to that shape.")
         return _faces(colmap, stored)
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
-        fail(
-            f"{label} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used: its size and focal "
-            "lengths have to be positive and all parameters finite. Correct it: write a focal length without its sign."
-        )
+        what = f"{label} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used"
+        fail(f"{what}: size and focal lengths have to be positive, all numbers finite. Correct it.")
     center = (camera.principal_point_x, camera.principal_point_y)
     lens = Lens(colmap, stored, Pinhole(*focal, *center, width, height))
     if not lens.distorts:
@@ -187,10 +184,8 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list
     w, h = int((left + right) * focal[0]), int((top + bottom) * focal[1])
     share = w * h / (width * height)
     if share < ABSURD_AREA or min(w, h) < 1:
-        fail(
-            f"the lens distortion of {label} is absurd: with {model} {camera.params_to_string()} undistorting would "
-            f"leave {100.0 * share:.2g} % of the picture. Correct it, or calibrate a simpler model (SIMPLE_RADIAL)."
-        )
+        what = f"{model} {camera.params_to_string()} would leave {100.0 * share:.2g} % of the picture"
+        fail(f"the lens distortion of {label} is absurd: {what}. Correct it, or calibrate a SIMPLE_RADIAL camera.")
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
     wide = max(pinhole.view) > MAX_VIEW_ANGLE - 0.5
     return _faces(colmap, stored) if wide else [replace(lens, pinhole=pinhole)]
@@ -206,26 +201,21 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
         full = camera.size
         small = (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
         if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
-            there, file = f"{small[0]} x {small[1]}", photograph.file
-            fail(
-                f"the image {file} has {size[0]} x {size[1]} pixels, but its camera is for {full[0]} x {full[1]}, "
-                f"of which 1/{downscale} is {there}. Make {file.parent} again, or leave --downscale-factor out."
-            )
+            camera_is = f"but 1/{downscale} of its camera's is {small[0]} x {small[1]}"
+            advice = f"Make {photograph.file.parent} again, or leave --downscale-factor out."
+            fail(f"the image {photograph.file} has {size[0]} x {size[1]} pixels, {camera_is}. {advice}")
         used = size or small
         key = (camera, used, photograph.downscaled)
         if key not in made:
             stored = used if photograph.downscaled else full
             made[key] = lenses_of(camera.rescaled(*used), stored, photograph.label)
             if made[key][0].face or camera.colmap.is_perspective_fisheye():
-                each = ", ".join(f"{one.face} {one.pinhole.width} x {one.pinhole.height}".strip() for one in made[key])
-                messages.append(
-                    f"{photograph.label} is {camera.model}: its photographs become pinhole pictures ({each})."
-                )
+                sizes_of = [f"{x.face} {x.pinhole.width} x {x.pinhole.height}".strip() for x in made[key]]
+                become = f"its photographs become pinhole pictures ({', '.join(sizes_of)})"
+                messages.append(f"{photograph.label} is {camera.model}: {become}")
         lenses.append(made[key])
-    for message in messages[:3]:
-        say(f"{message[0].upper()}{message[1:]}")
-    if len(messages) > 3:
-        say(f"So are those of {len(messages) - 3} more cameras.")
+    if messages:
+        say(f"{listed(messages)}.")
     return lenses
 
 
@@ -324,12 +314,10 @@ def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[s
     none if SPHERICAL_MODEL. Raises CaptureError: COLMAP has no such camera, or `values` are too many or too few."""
     if kind == "EQUIRECTANGULAR":
         return SPHERICAL_MODEL, ()
-    if kind not in ("PERSPECTIVE", "FISHEYE", "FISHEYE624"):
-        fail(
-            f"the camera {label} cannot be used: it is neither a perspective, a fisheye nor an equirectangular camera, "
-            f"which are the kinds that can be trained on, but {kind}. Correct the capture."
-        )
-    counts = {"PERSPECTIVE": (6,), "FISHEYE": (4, 6), "FISHEYE624": (12,)}[kind]
+    counts = {"PERSPECTIVE": (6,), "FISHEYE": (4, 6), "FISHEYE624": (12,)}.get(kind)
+    if counts is None:
+        kinds = "neither a perspective, a fisheye nor an equirectangular camera"
+        fail(f"the camera {label} cannot be used: it is {kinds}, but {kind}. Correct the capture.")
     if len(values) not in counts:
         needs = f"{kind.lower()} cameras need {counts[0]} (k1, k2, k3, k4, then p1, p2)"
         fail(f"the camera {label} has {len(values)} distortion_params; {needs}. Correct the capture.")
@@ -339,10 +327,8 @@ def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[s
         return "OPENCV_FISHEYE", tuple(values[:4])
     k1, k2, k3, k4, p1, p2 = values
     if k4 != 0.0:
-        fail(
-            f"the camera {label} cannot be used: its k4 is {k4:g}, but perspective cameras have k1 to k3, p1, p2 only. "
-            "For a fisheye write camera_model OPENCV_FISHEYE; else undistort first (COLMAP's image_undistorter)."
-        )
+        what = f"the camera {label} cannot be used: its k4 is {k4:g}, which perspective cameras lack"
+        fail(f"{what}. For a fisheye write camera_model OPENCV_FISHEYE; else undistort first.")
     if k3 != 0.0:
         return "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)
     return ("OPENCV", (k1, k2, p1, p2)) if any((k1, k2, p1, p2)) else ("PINHOLE", ())

@@ -51,6 +51,7 @@ CONVENTIONS: dict[str, tuple[Reading, Pose]] = {
     "stray-scanner": (Reading("opencv", "c2w", "xyzw"), Y_UP),
 }  # fmt: skip
 """Conventions of formats, with the transform of their world; of others camera to world with OpenGL axes."""
+OF_EARLIER_TOOL = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # applied, but not stated
 NGP_SCALE = 0.3333  # factor on positions of instant-ngp's captures, as in nerfstudio's reader
 BLENDER_SIDE = 1.5  # half the side of a Blender data set's box, as in nerfstudio's reader
 
@@ -59,14 +60,14 @@ def check_options(options: Any, call: Callable[[str], str] = str) -> None:
     """Check the options of any reader of captures that it has; `call` gives the caller's name of an option. Raises
     CaptureError: one is out of range."""
     mode = getattr(options, "eval_mode", None)
-    for name, used, within, what in (
+    for name, used, is_valid, what in (
         ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
         ("downscale_factor", True, lambda value: value is None or value >= 1 and value % 1 == 0, "1 or more"),
         ("train_split_fraction", mode == "fraction", lambda value: 0.0 < value <= 1.0, "above 0 and at most 1"),
         ("eval_interval", mode == "interval", lambda value: value >= 1, "1 or more"),
         ("points", isinstance(options, CaptureOptions), lambda value: value in get_args(Choice), "one of its choices"),
     ):
-        if used and hasattr(options, name) and not within(value := getattr(options, name)):
+        if used and hasattr(options, name) and not is_valid(value := getattr(options, name)):
             fail(f"{call(name)} is {value}, but has to be {what}. Correct it, or leave it out.")
 
 
@@ -114,10 +115,8 @@ class CaptureOptions(SplitOptions, FrameOptions):
         for name, formats in OPTION_FORMATS.items():
             default = getattr(type(self).__dataclass_fields__.get(name), "default", None)
             if found.format not in formats and getattr(self, name, default) != default:
-                fail(
-                    f"--{name.replace('_', '-')} is not for {found.path}, which is read as {found.format}, but for "
-                    f"{', '.join(formats)}. Leave it out, or give --format."
-                )
+                read_as = f"{found.path}, which is read as {found.format}, but for {', '.join(formats)}"
+                fail(f"--{name.replace('_', '-')} is not for {read_as}. Leave it out, or give --format.")
         return found
 
     def source(self, found: Found, need_photos: bool = True) -> Source:
@@ -174,8 +173,8 @@ class _Reader:
     def read(self) -> Capture:
         found = self.found
         if found.unread:
-            named = listed(found.unread, most=12)
-            warn(f"{found.folder} holds poses that are not read: {named}. Poses are computed from the photographs.")
+            unread = listed(found.unread, most=12)
+            warn(f"{found.folder} holds poses that are not read: {unread}. Poses are computed from the photographs.")
         readers = dict.fromkeys(WITH_MODEL, self._colmap) | dict.fromkeys(SCANNED, self._scanned)
         capture = {**readers, "blender": self._blender}.get(found.format, self._transforms)()
         capture.downscale, capture.poses_as = self.downscale, self.poses_as
@@ -214,37 +213,31 @@ class _Reader:
     def _transforms(self) -> Capture:
         options, found = self.options, self.found
         read, source = self._read_transforms(found.path), str(found.path)
-        meta, frame = read.meta, options
+        meta, frame, auto, own = read.meta, options, options.points == "auto", None
         earlier = found.folder / "colmap/sparse/0"  # points of nerfstudio's tool before it stated either
-        applied, own, boxed = meta.get("applied_transform"), None, False
-        if applied is None and earlier.is_dir():
-            applied = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
-        what, auto = f"{source} ({found.format}, {len(read.photographs)} photographs)", options.points == "auto"
+        applied = meta.get("applied_transform", OF_EARLIER_TOOL if earlier.is_dir() else None)
         model = read_model(earlier) if auto and "ply_file_path" not in meta and is_model(earlier) else None
-        if model is not None:
-            what += f", points of {earlier}"
+        with_points = "" if model is None else f", points of {earlier}"
+        what = f"{source} ({found.format}, {len(read.photographs)} photographs){with_points}"
         photographs = self._checked(what, read.photographs, read.named, source)
         if found.format == "instant-ngp":  # whose scale is that of its bounding box
             half = 0.5 * check_number(read.path, "aabb_scale", meta.get("aabb_scale", 1), "for all frames")
-            if not 0.0 < half < math.inf:
-                fail(f"{read.path}: aabb_scale is {meta['aabb_scale']}, which is no positive number. Correct it.")
             frame = FrameOptions(NGP_SCALE, "none", "none", auto_scale_poses=False, scene_scale=half)
-            frame, boxed = fit_scale(frame, photographs, source), "aabb_scale" in meta
+            frame = fit_scale(frame, photographs, source)
         elif "orientation_override" in meta:
-            if meta["orientation_override"] not in get_args(Orientation):
-                allowed = ", ".join(get_args(Orientation))
-                fail(f"{read.path}: orientation_override is {meta['orientation_override']!r}, none of {allowed}.")
-            frame = replace(frame, orientation_method=meta["orientation_override"])
-            say(f"{read.path} asks for the orientation method {frame.orientation_method}.")
+            method = meta["orientation_override"]
+            if method not in get_args(Orientation):
+                fail(f"{read.path}: orientation_override is {method!r}, none of {', '.join(get_args(Orientation))}.")
+            frame = replace(frame, orientation_method=method)
+            say(f"{read.path} asks for the orientation method {method}.")
         if auto and "ply_file_path" in meta:
             hint = f"Put it there again, or remove ply_file_path from {read.path} to start from random points."
             path = found.folder / meta["ply_file_path"]
             own = self._colored(*read_cloud(path, hint), photographs, path)
         elif model is not None and applied is not None:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
-        scale = float(meta.get("applied_scale", 1.0))
-        points = self._points(own, photographs, source)
-        of_file = {"applied": applied, "applied_scale": scale, "declares_box": boxed}
+        points, boxed = self._points(own, photographs, source), found.format == "instant-ngp" and "aabb_scale" in meta
+        of_file = {"applied": applied, "applied_scale": meta.get("applied_scale", 1.0), "declares_box": boxed}
         return Capture(found.format, source, photographs, points, frame, read.lists, **of_file)
 
     def _colmap(self) -> Capture:
@@ -280,40 +273,36 @@ class _Reader:
         """Read a Blender data set with its own split. If one of the val and test files is missing, or lacks all its
         photographs, the other serves for both; without either there is no split."""
         options, found, need_photos = self.options, self.found, self.need_photos
-        train = self._read_transforms(found.folder / "transforms_train.json")
-        parts: dict[str, list[Photograph]] = {"train": train.photographs}
-        named = set(train.named)
+        train = self._read_transforms(found.folder / SPLITS[0])
+        every, named, source = list(train.photographs), set(train.named), str(train.path)
+        parts: dict[str, Sequence[int]] = {"train": range(len(every))}
         for name in ("val", "test"):
             if (found.path / f"transforms_{name}.json").is_file():
                 part = self._read_transforms(found.folder / f"transforms_{name}.json")
-                parts[name] = [each for each in part.photographs if not need_photos or os.path.isfile(each.file)]
-                if lacking := [each.file for each in part.photographs if each not in parts[name]]:
-                    what = str(len(lacking)) if parts[name] else "all"
-                    left = f"left out: {listed(lacking)}"
-                    warn(f"{part.path} lacks {what} of its {len(part.photographs)} photographs, {left}.")
+                there = [each for each in part.photographs if not need_photos or os.path.isfile(each.file)]
+                if lacking := [each.file for each in part.photographs if each not in there]:
+                    count, left = len(lacking) if there else "all", f"left out: {listed(lacking)}"
+                    warn(f"{part.path} lacks {count} of its {len(part.photographs)} photographs, {left}.")
+                parts[name] = range(len(every), len(every) + len(there))
+                every += there
                 named |= part.named
-        source, every = str(train.path), [each for part in parts.values() for each in part]
         every = self._checked(f"{source} (blender, {len(train.photographs)} photographs)", every, named, source)
-        numbers, start = {}, 0
-        for name, part in parts.items():
-            numbers[name] = range(start, start + len(part))
-            start += len(part)
-        used = every[: len(train.photographs)]
+        trained = every[: len(train.photographs)]
         frame = FrameOptions(options.scale_factor, "none", "none", auto_scale_poses=False, scene_scale=BLENDER_SIDE)
         if options.scale_factor == 1.0:  # else the user has chosen it
-            frame = fit_scale(frame, used, source)
-        points = self._points(None, used, source)
-        return Capture(found.format, source, every, points, frame, parts=numbers)
+            frame = fit_scale(frame, trained, source)
+        points = self._points(None, trained, source)
+        return Capture(found.format, source, every, points, frame, parts=parts)
 
     def _checked(
         self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None], source: str
     ) -> list[Photograph]:
         """Report what is read; fail if photographs or masks are missing. If it came with poses, report pictures beside
         them that are not `named`, and give photographs the poses that they are meant to have; see `as_meant`."""
-        text = f"Reading {what}. {self.found.how_to_choose()}"
+        text = [f"Reading {what}.", self.found.how_to_choose()]
         if self.found.format == "instant-ngp" and self.options.format == "auto":  # a guess: both use one name
-            text = f"{text.rstrip()} If nerfstudio wrote it: `bitymi-data --format nerfstudio`."
-        say(text.rstrip())
+            text.append("If nerfstudio wrote it: `bitymi-data --format nerfstudio`.")
+        say(" ".join(filter(None, text)))
         if self.need_photos:
             check_photographs_exist(Path(source), [each.file for each in photographs])
             check_masks(photographs)
@@ -352,5 +341,5 @@ class _Reader:
             return None
         from bitymi_ns.capture.known_poses import triangulated  # slow to import, and seldom needed
 
-        found = triangulated(photographs, folder, source)
-        return (cloud_beside(folder, found, photographs, self._placed) if auto else None) or found
+        points = triangulated(photographs, folder, source)
+        return (cloud_beside(folder, points, photographs, self._placed) if auto else None) or points

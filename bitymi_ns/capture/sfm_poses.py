@@ -5,11 +5,14 @@ import json
 import os
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
+
+from pydantic import TypeAdapter
 
 from bitymi_ns.capture.cache import keep_work_folder
+from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.capture.colmap_views import Origin, Source
 from bitymi_ns.capture.frame import gps_line
 from bitymi_ns.capture.image_files import image_size, in_threads
@@ -24,13 +27,12 @@ IMAGES = "images"
 ORIGIN = "origin.json"  # file of the model's `Origin`; a folder without it holds at most a report
 
 
-@dataclass(frozen=True)
-class KeptPoses:
+class KeptPoses(NamedTuple):
     """Poses in the folder of a run."""
 
     folder: Path  # holds MODEL, the report, and IMAGES if these are upright copies or frames
     origin: Origin  # its photographs are IMAGES if it names no folder
-    left_out: Mapping[str, str] = field(default_factory=dict)  # photographs without a pose, and why
+    left_out: Mapping[str, str]  # photographs without a pose, and why
 
     def found(self, data: Path) -> Found:
         """Return the capture at `data` as the run recognized it, whatever lies beside it by now."""
@@ -49,27 +51,25 @@ def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings
         options = SfmOptions(**asdict(settings), masks=masks, use_masks=use_masks)
         poses = find_poses(found.path, options, progress, warn, found.folder)
     keep_work_folder(poses.report.parent)
-    say(
-        f"Poses of {poses.registered} of {poses.given} photographs of {found.path}, to {poses.reprojection_error:.2f} "
-        f"pixels; how they were found is in {poses.report}."
-    )
+    placed = f"Poses of {poses.registered} of {poses.given} photographs of {found.path}"
+    say(f"{placed}, to {poses.reprojection_error:.2f} pixels; how they were found is in {poses.report}.")
     if by_gps := gps_line(poses.report):
         say(by_gps)
     if poses.doubt:
         warn(poses.doubt)
-    source = Source(poses.model, poses.images, poses.left_out)
     made = poses.images.is_relative_to(poses.report.parent)  # upright copies and frames are in the work folder
     photographs = None if made else os.path.relpath(poses.images, found.folder)
     assert found.format in ("photographs", "video")
     origin = Origin(found.format, os.path.relpath(found.path, found.folder), photographs, settings)
-    return replace(source, report=poses.report, origin=origin)
+    return Source(read_model(poses.model), poses.model, poses.images, poses.left_out, poses.report, origin)
 
 
 def kept_source(found: Found, kept: KeptPoses, need_photos: bool) -> Source:
     """Return the model of a run. Raises CaptureError: needed photographs are missing, or have changed their size."""
     photographs = kept.origin.photographs
     images = kept.folder / IMAGES if photographs is None else found.folder / photographs
-    source = Source(kept.folder / MODEL, images, kept.left_out)
+    model = kept.folder / MODEL
+    source = Source(read_model(model), model, images, kept.left_out, kept.folder, kept.origin)
     if need_photos:
         files = source.files()
         missing = [file.readlink() if file.is_symlink() else file for file in files if not os.path.isfile(file)]
@@ -81,13 +81,11 @@ def kept_source(found: Found, kept: KeptPoses, need_photos: bool) -> Source:
         what = [f"{len(missing)} are missing ({listed(missing)})"] if missing else []
         what += [f"{len(changed)} have another size ({listed(changed)})"] if changed else []
         if what:
-            fail(
-                f"of the {len(files)} photographs that the run was trained with, {' and '.join(what)}, so its poses in "
-                f"{kept.folder} cannot be used. Put these photographs back as they were, or train again."
-            )
+            which = f"of the {len(files)} photographs that the run was trained with, {' and '.join(what)}"
+            fail(f"{which}, so its poses in {kept.folder} cannot be used. Put them back as they were, or train again.")
     count = len(source.model.images)
     say(f"Poses of {count} photographs of {found.path} as the run was trained with them, of {kept.folder}.")
-    return replace(source, report=kept.folder, origin=kept.origin)
+    return source
 
 
 def has_kept_poses(folder: Path) -> bool:
@@ -102,14 +100,7 @@ def read_kept_poses(folder: Path | None) -> KeptPoses | None:
     path = folder / ORIGIN
     which = f"{path}, which says of what the poses of the run were found,"
     with parsing(which, f"Put the folder {folder} back as it was, or train again."):
-        values: dict[str, Any] = read_json(path)
-        entries, left_out = dict(values["origin"]), dict(values["left_out"])
-        if entries.get("settings") is not None:  # earlier versions do not state them
-            entries["settings"] = SfmSettings(**entries["settings"])
-        origin = Origin(**entries)
-        if origin.kind not in ("photographs", "video"):
-            raise ValueError(f"it is of {origin.kind}")
-    return KeptPoses(folder, origin, left_out)
+        return TypeAdapter(KeptPoses).validate_python({**read_json(path), "folder": folder})
 
 
 def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
@@ -123,9 +114,8 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
             unused.append(f"--sfm.{each.name.replace('_', '-')} {value}")
     if unused:
         warn(
-            f"{' and '.join(unused)} {'is' if len(unused) == 1 else 'are'} not used: the run goes on with the poses it "
-            f"was trained with, in {folder}, because what it has learned fits no others. To have poses computed again, "
-            "start a new run: leave out --load-dir and --load-checkpoint."
+            f"{' and '.join(unused)} is not used: the run goes on with the poses it was trained with, in {folder}. To "
+            "have poses computed again, start a new run: leave out --load-dir and --load-checkpoint."
         )
     return settings or requested
 

@@ -41,14 +41,14 @@ CAMERA_TYPES = {
 MAX_SIDE = 1 << 20  # largest plausible width or height of a picture, pixels
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
-FOCALS = {"x": ("fl_x", "camera_angle_x", "x_fov"), "y": ("fl_y", "camera_angle_y", "y_fov")}
-"""Entries of a focal length: in pixels, or by the view angle in radians, or in degrees."""
+FOCALS = ("fl_x", "camera_angle_x", "x_fov"), ("fl_y", "camera_angle_y", "y_fov")
+"""Entries of a focal length, across and down: in pixels, or by the view angle in radians, or in degrees."""
 OF_MATRIX = {"fl_x": (0, 0), "fl_y": (1, 1), "cx": (0, 2), "cy": (1, 2)}  # rows and columns of a camera matrix
 EQUAL_AREA = ("equirectangular", "is_equirectangular")  # instant-ngp's entries for 360-degree rows of equal areas
 USED = {
     "frames", *FILE_KEYS, "transform_matrix", "camera_model", "ply_file_path",
     *MODELS, *EQUAL_AREA, "applied_transform", "applied_scale", "orientation_override", "aabb_scale",
-    *INTRINSICS, *DISTORTION, *FOCALS["x"], *FOCALS["y"],
+    *INTRINSICS, *DISTORTION, *FOCALS[0], *FOCALS[1],
 }  # fmt: skip
 IRRELEVANT = {"rotation", "sharpness", "colmap_im_id", "made_by"}  # unused entries that are not reported
 UNKNOWN_SIZE = 800  # pixels along the sides of missing pictures of unstated size, where none are needed
@@ -137,10 +137,8 @@ def _translate(path: Path, holder: dict[str, Any]) -> None:
         return
     for key in EQUAL_AREA:
         if holder.get(key):
-            fail(
-                f"{path}: {key} is set, by which instant-ngp means pictures whose rows show equal areas, which cannot "
-                'be read. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.'
-            )
+            what = f"{path}: {key} is set, which means rows of equal areas, which cannot be read"
+            fail(f'{what}. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.')
     stated = [model if holder[key] else "OPENCV" for key, model in MODELS.items() if key in holder]
     if stated:
         holder["camera_model"] = min(stated, key="OPENCV".__eq__)
@@ -175,11 +173,14 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
 
 
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
-    """Convert an entry, also in quotes, to a number. Raises CaptureError: it is none, or no number of pixels (w, h)."""
+    """Convert an entry, also in quotes, to a number. Raises CaptureError: it is none, no number of pixels (w, h), or no
+    positive one (applied_scale, aabb_scale)."""
     try:
         number = float("" if isinstance(value, bool) else value)
     except (TypeError, ValueError, OverflowError):
         fail(f"{path}: {key} {label} is {value!r}, which is no number")
+    if key.endswith("_scale") and not 0.0 < number < math.inf:
+        fail(f"{path}: {key} is {value!r}, which is no positive number. Correct it or remove it.")
     if key not in ("w", "h"):
         return number  # what is not finite is refused with the cameras
     if not number.is_integer() or not 1 <= number <= MAX_SIDE:
@@ -196,9 +197,7 @@ def _check_applied(path: Path, meta: dict[str, Any]) -> None:
             fail(f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in this file's frame.")
         meta["applied_transform"] = transform
     if "applied_scale" in meta:
-        scale = check_number(path, "applied_scale", meta["applied_scale"], "for all frames")
-        if not 0.0 < scale < math.inf:
-            fail(f"{path}: applied_scale is {scale}, which is no positive number. Correct it or remove it.")
+        meta["applied_scale"] = check_number(path, "applied_scale", meta["applied_scale"], "for all frames")
 
 
 def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path) -> ColmapCamera:
@@ -212,34 +211,27 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
                     return key, check_number(path, key, holder[key], label)
         return None
 
-    width, height, cx, cy = (None if (found := value(key)) is None else found[1] for key in ("w", "h", "cx", "cy"))
-    if width is None or height is None:
-        size = image_size(file)
-        if size is not None:
-            width, height = width or size[0], height or size[1]
-        else:  # reported when it is read; without photographs any size serves
-            width, height = width or height or UNKNOWN_SIZE, height or width or UNKNOWN_SIZE
+    width, height, cx, cy = (None if (entry := value(key)) is None else entry[1] for key in ("w", "h", "cx", "cy"))
+    if (
+        width is None or height is None
+    ):  # missing pictures are reported when read; where none are needed any size serves
+        size = image_size(file) or (height or UNKNOWN_SIZE, width or UNKNOWN_SIZE)
+        width, height = width or size[0], height or size[1]
+    middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
     if frame.get("camera_model", meta.get("camera_model")) == "EQUIRECTANGULAR":
-        middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
         if max(abs(middle[0] - width / 2.0), abs(middle[1] - height / 2.0)) > 1.0:
-            fail(
-                f"{path}: {name} is EQUIRECTANGULAR, but its cx and cy are {middle[0]:g} and {middle[1]:g}, not the "
-                f"middle of its {width} x {height} pixels. Remove them, or shift the picture and turn the pose."
-            )
+            what = f"its cx and cy are {middle[0]:g} and {middle[1]:g}, not the middle of its {width} x {height} pixels"
+            fail(f"{path}: {name} is EQUIRECTANGULAR, but {what}. Remove them, or shift the picture.")
         return ColmapCamera(SPHERICAL_MODEL, int(width), int(height), (float(width), float(height)))
-    sides = {"x": width, "y": height}
-    focal: dict[str, float] = {}
-    for axis, keys in FOCALS.items():
-        found = value(*keys)
-        if found is not None:
-            focal[axis] = _focal_length(path, *found, sides[axis])
-    if not focal:
+    stated = (value(*keys) for keys in FOCALS)
+    fx, fy = (None if entry is None else _focal_length(path, *entry, side)
+              for entry, side in zip(stated, (width, height), strict=True))  # fmt: skip
+    fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
+    if fx is None or fy is None:
         where = "neither fl_x nor camera_angle_x (radians) is in the frame or at the top of the file"
         fail(f"{path} gives no focal length of {name}: {where}. Add one of them.")
-    fx, fy = focal.get("x", focal.get("y", 0.0)), focal.get("y", focal.get("x", 0.0))
-    pinhole = (fx, fy, width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
     model, coefficients = _distortion(path, meta, frame)
-    return ColmapCamera(model, int(width), int(height), (*pinhole, *coefficients))
+    return ColmapCamera(model, int(width), int(height), (fx, fy, *middle, *coefficients))
 
 
 def _focal_length(path: Path, key: str, value: float, side: float) -> float:

@@ -10,6 +10,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Protocol
 
+from pydantic import TypeAdapter
+
 from bitymi_ns.capture.cache import emptied
 from bitymi_ns.capture.types import ColmapCamera
 
@@ -83,9 +85,7 @@ class Job:
 
     @staticmethod
     def parse(text: str) -> Job:
-        values = json.loads(text)
-        values["cameras"] = [CameraGroup(ColmapCamera(*g["camera"]), g["prior"], g["names"]) for g in values["cameras"]]
-        return Job(**values)
+        return TypeAdapter(Job).validate_json(text)
 
 
 class NoPoses(Exception):

@@ -113,18 +113,14 @@ def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
             largest = np.argsort(-scale, kind="stable")[:size]
             values = opened.read_descriptors(ids[name]).data[largest].astype(np.float32)
             descriptors[i, : len(largest)] = values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-6)
-    alike = np.zeros((count, count), np.float32)
-    step = max(1, 2**25 // size**2)
-    for i in range(count - 1):
+    alike, rows = np.zeros((count, count), np.float32), np.arange(size)
+    for i in range(count):
         tell("looking for overlap", i, count)
-        for first in range(i + 1, count, step):
-            others = descriptors[first : first + step]
-            cosine = (descriptors[i] @ others.reshape(-1, 128).T).reshape(size, len(others), size)
-            there = cosine.argmax(axis=2)  # [size, others]
-            back = cosine.argmax(axis=0)  # [others, size]
-            best = np.take_along_axis(cosine, there[..., None], axis=2)[..., 0]
-            mutual = np.take_along_axis(back, there.T, axis=1).T == np.arange(size)[:, None]
-            alike[i, first : first + step] = (mutual & (best > COARSE_COSINE)).sum(axis=0)
+        for j in range(i + 1, count):
+            cosine = descriptors[i] @ descriptors[j].T
+            nearest = cosine.argmax(1)
+            mutual = cosine.argmax(0)[nearest] == rows
+            alike[i, j] = (mutual & (cosine[rows, nearest] > COARSE_COSINE)).sum()
     tell("looking for overlap", count, count)
     return alike + alike.T
 

@@ -3,6 +3,7 @@
 import math
 import struct
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,8 +40,8 @@ def read_exif(image: Image.Image) -> Exif:
     millimetres = number(detail.get(ExifTags.Base.FocalLength))
     names = [tags.get(ExifTags.Base.Make), tags.get(ExifTags.Base.Model), detail.get(ExifTags.Base.LensModel)]
     focal, doubt = focal_length(detail, image.size)
-    fraction = str(detail.get(ExifTags.Base.SubsecTimeOriginal) or "").strip()
-    time = str(detail.get(ExifTags.Base.DateTimeOriginal) or "").strip()
+    time, fraction = (str(detail.get(tag) or "").strip()
+                      for tag in (ExifTags.Base.DateTimeOriginal, ExifTags.Base.SubsecTimeOriginal))  # fmt: skip
     time = f"{time}.{fraction}" if time and fraction else time
     parts = [str(name).strip("\0 ") for name in names if name] + ([f"{millimetres:g} mm"] if millimetres else [])
     return Exif(" ".join(parts), focal, doubt, _position(gps), time, _up(image, tags, detail))
@@ -58,8 +59,7 @@ def focal_length(detail: Mapping[int, Any], size: tuple[int, int]) -> tuple[floa
     if not film and not (millimetres and density):
         return None, ""
     if len(stated) == 2:
-        there, was = long / short, max(stated) / min(stated)
-        if abs(there / was - 1) > SAME_ASPECT:
+        if abs(long / short / (max(stated) / min(stated)) - 1) > SAME_ASPECT:
             return None, f"cropped: {long} x {short} pixels of {max(stated):.0f} x {min(stated):.0f}"
     elif density:
         return None, "its pixel density belongs to an image of unknown size"
@@ -76,11 +76,9 @@ def focal_length(detail: Mapping[int, Any], size: tuple[int, int]) -> tuple[floa
 
 def number(value: Any) -> float | None:
     """Convert to a positive finite number, or None: files hold text and rationals with a denominator of 0."""
-    try:
-        found = float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    return found if math.isfinite(found) and found > 0 else None
+    with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
+        return float(value) if 0 < float(value) < math.inf else None
+    return None
 
 
 EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
@@ -99,8 +97,8 @@ def exposure_exif(image: Image.Image) -> Image.Exif:
     return kept
 
 
-def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
-    """Read shutter time (seconds), f-number and ISO; None without a time. Raises many errors on broken EXIF."""
+def exposure_settings(image: Image.Image) -> tuple[float | None, ...]:
+    """Read shutter time (seconds), f-number and ISO; () without a time. Raises many errors on broken EXIF."""
     detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
     values = []
     for tag in EXPOSURE:
@@ -108,7 +106,7 @@ def exposure_settings(image: Image.Image) -> tuple[float | None, ...] | None:
         if isinstance(value, (tuple, list)):  # several ISO values
             value = value[0] if value else None
         values.append(number(value))
-    return tuple(values) if values[0] else None
+    return tuple(values) if values[0] else ()
 
 
 def exif_stops(seconds: float, f_number: float, iso: float) -> float:
@@ -121,10 +119,10 @@ def _up(image: Image.Image, tags: Mapping[int, Any], detail: Mapping[int, Any]) 
     note = detail.get(ExifTags.Base.MakerNote)
     if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
         return None
-    found = apple_acceleration(note)
-    if found is None or not abs(math.hypot(*found) - 1) <= STILL:
+    down = apple_acceleration(note)
+    if down is None or not abs(math.hypot(*down) - 1) <= STILL:
         return None
-    left, bottom, into = (value / math.hypot(*found) for value in found)
+    left, bottom, into = (value / math.hypot(*down) for value in down)
     # the sensor's rows run from top to bottom of the phone, its columns from right to left
     turns = {1: (bottom, left), 3: (-bottom, -left), 6: (-left, bottom), 8: (left, -bottom)}
     # Pillow turns HEIC on opening, and keeps its orientation here
@@ -142,7 +140,7 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
     has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its start."""
     if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
         return None
-    try:
+    with suppress(struct.error, ZeroDivisionError):
         (entries,) = struct.unpack_from(">H", note, 14)
         for i in range(entries):
             tag, kind, count, offset = struct.unpack_from(">HHII", note, 16 + 12 * i)
@@ -150,8 +148,6 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
                 parts = struct.unpack_from(">6i", note, offset)
                 x, y, z = (parts[j] / parts[j + 1] for j in (0, 2, 4))
                 return x, y, z
-    except (struct.error, ZeroDivisionError):
-        pass
     return None
 
 

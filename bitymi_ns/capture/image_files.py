@@ -24,6 +24,7 @@ MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones t
 THREADS = 4
 PROPORTIONS = 0.02  # relative difference of aspect ratios by rounding
 FINGERPRINT_SIZE = 64  # pixels across and down that fingerprints compare
+WHITES = ((255.0, 65535.0), (1.0, 255.0))  # usual ones of integers, and of floating-point numbers
 EMPTY: dict[str, Callable[[npt.NDArray[np.uint8]], bool]] = {
     "transparent everywhere": lambda image: image.shape[-1] == 4 and not image[..., 3].any(),
     "of one color throughout": lambda image: bool((image == image[0, 0]).all()),
@@ -77,15 +78,11 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
     """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown. An entry
     that most photographs lack (f-number of manual lenses, ISO of some cameras) counts as equal for all. Photographs
     with other entries than most are NaN."""
-    found = in_threads(lambda path: from_header(path, exposure_settings, None), paths)
-    kinds = [None if each is None else tuple(value is not None for value in each) for each in found]
-    usual = Counter(kind for kind in kinds if kind is not None).most_common(1)
-    return [
-        exif_stops(*(value or 1.0 for value in each))
-        if each is not None and usual and kind == usual[0][0]
-        else math.nan
-        for each, kind in zip(found, kinds, strict=True)
-    ]
+    settings = in_threads(lambda path: from_header(path, exposure_settings, ()), paths)
+    stated = [tuple(value is not None for value in entry) for entry in settings]
+    (usual, _), *_ = Counter(filter(None, stated)).most_common(1) or [((), 0)]
+    return [exif_stops(*(value or 1.0 for value in entry)) if entry and entries == usual else math.nan
+            for entry, entries in zip(settings, stated, strict=True)]  # fmt: skip
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
@@ -107,8 +104,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
     except Image.DecompressionBombError as error:
-        camera = "w, h, fl_x, fl_y, cx and cy of its camera"
-        fail(f"{path} has more than {MAX_PIXELS:,} pixels. Make it smaller, and {camera} with it.", error)
+        fail(f"{path} has more than {MAX_PIXELS:,} pixels. Make it smaller, and its camera with it.", error)
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
@@ -116,22 +112,23 @@ def eight_bits(image: Image.Image) -> Image.Image:
     if not image.mode.startswith(("I", "F")):
         return image
     values = np.asarray(image, dtype=np.float64)
-    low, high = float(values.min()), float(values.max())
-    if image.mode.startswith("I;16") or image.format == "PNG":
-        whites = (65535.0,)
-    else:  # TIFF and others, which do not state their white
-        whites = (1.0, 255.0) if image.mode == "F" else (255.0, 65535.0)
-    white = next((white for white in whites if high <= white), None)
-    if white is None or not low >= 0.0:  # also NaN
-        raise ValueError(
-            f"its values lie between {low:g} and {high:g}, those of such a file should between 0 and {whites[-1]:g} "
-            f"(PIL's mode {image.mode}); save it with 8 or 16 bits per channel"
-        )
-    grey = Image.fromarray((values * (255.0 / white) + 0.5).astype(np.uint8))
+    whites = WHITES[image.mode == "F"]  # of TIFF and others, which do not state theirs
+    whites = (65535.0,) if image.mode.startswith("I;16") or image.format == "PNG" else whites
+    grey = Image.fromarray(to_bytes(values, whites, "values"))
     turn = Image.Exif()
     turn[ExifTags.Base.Orientation] = image.getexif().get(ExifTags.Base.Orientation, 1)
     grey.info["exif"] = turn.tobytes()
     return grey
+
+
+def to_bytes(values: npt.NDArray[np.float64], whites: Sequence[float], what: str) -> npt.NDArray[np.uint8]:
+    """Scale non-negative numbers to bytes; white is the smallest of `whites` that bounds them. Raises ValueError, with
+    `what` they are: none does."""
+    low, high = float(values.min()), float(values.max())
+    white = next((white for white in whites if high <= white), None)
+    if white is None or not low >= 0.0:  # also NaN
+        raise ValueError(f"its {what} lie between {low:g} and {high:g}, not between 0 and {max(whites):g}")
+    return (values * (255.0 / white) + 0.5).astype(np.uint8)
 
 
 def in_srgb(image: Image.Image) -> Image.Image:

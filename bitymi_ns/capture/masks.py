@@ -36,10 +36,10 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
         folders.insert(0, shown.parent)
     whole = [folder / name for folder in folders for name in ("masks", "mask")] if stated is None else [stated]
     reduced = [masks.with_name(f"{masks.name}_{downscale}") for masks in whole if downscale > 1]
-    found = next(filter(os.path.isdir, (*whole, *reduced)), None)
-    if found is None and stated is not None:
+    masks = next(filter(os.path.isdir, (*whole, *reduced)), None)
+    if masks is None and stated is not None:
         fail(f"the folder of masks {stated} does not exist")
-    return found
+    return masks
 
 
 def find_masks(
@@ -47,9 +47,9 @@ def find_masks(
 ) -> tuple[dict[str, Path], bool]:
     """Find the masks of photographs by their names in the folder `base`: beside them unless a folder is `stated`, else
     in the folder `masks`. Return them by name, and whether they are beside."""
-    found = {} if stated else _named(names, base, (*MASK.names.split(), *DYNAMIC.names.split()))
-    if found or masks is None:
-        return found, bool(found)
+    beside = {} if stated else _named(names, base, (*MASK.names.split(), *DYNAMIC.names.split()))
+    if beside or masks is None:
+        return beside, bool(beside)
     return _named(names, masks, ("NAME", *MASK.names.split())), False
 
 
@@ -62,7 +62,7 @@ def _named(names: Sequence[str], folder: Path, forms: Sequence[str]) -> dict[str
         stems = [file.stem.lower() for file in files]
         exact = dict(zip(reversed(stems), reversed(files), strict=True))
         there[parent] = {f"{int(stem)}": file for stem, file in exact.items() if stem.isdecimal()} | exact
-    found = {}
+    mask_of = {}
     for path in map(PurePath, names):
         bases = [path.name.lower(), path.stem.lower()]
         if bases[0].endswith(COPY) and bases[1].endswith(PHOTOGRAPHS):
@@ -70,8 +70,8 @@ def _named(names: Sequence[str], folder: Path, forms: Sequence[str]) -> dict[str
         bases += [f"{int(path.stem)}"] if path.stem.isdecimal() else []
         files = (there[path.parent].get(form.replace("NAME", each)) for each in bases for form in forms)
         if mask := next(filter(None, files), None):
-            found[str(path)] = mask
-    return found
+            mask_of[str(path)] = mask
+    return mask_of
 
 
 def _is_dynamic(path: Path) -> bool:
@@ -120,20 +120,17 @@ def with_masks(
         masks = mask_folder(base, capture, None if stated is None else capture / stated, downscale)
     except CaptureError as error:
         fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
-    found, beside = find_masks(names, base, masks, stated is not None)
-    missing = [name for name in names if name not in found]
-    if masks and missing and not beside and (found or stated or images):
-        others = ", but of others" if found else ""
-        fail(
-            f"{masks} has no mask of {listed(missing)}{others}. Give every photograph a mask of its name with .png (a "
-            f"white picture lets all pixels count); {LEAVE_OUT}."
-        )
-    if found:
-        some = listed([path.name for path in found.values()], most=1)
-        where = f"{some} beside {len(files)} photographs" if beside else f"of {masks}"
-        black = "counts" if beside and all(map(_is_dynamic, found.values())) else "does not count"
+    mask_of, beside = find_masks(names, base, masks, stated is not None)
+    missing = [name for name in names if name not in mask_of]
+    if masks and missing and not beside and (mask_of or stated or images):
+        advice = "Give every photograph a mask of its name with .png, all white if all counts"
+        fail(f"{masks} has no mask of {listed(missing)}. {advice}; {LEAVE_OUT}.")
+    if mask_of:
+        first = listed([path.name for path in mask_of.values()], most=1)
+        where = f"{first} beside {len(files)} photographs" if beside else f"of {masks}"
+        black = "counts" if beside and all(map(_is_dynamic, mask_of.values())) else "does not count"
         say(f"The masks {where} are used, of which black {black}; {LEAVE_OUT}.")
-    return [replace(each, mask=found.get(name)) for each, name in zip(photographs, names, strict=True)]
+    return [replace(each, mask=mask_of.get(name)) for each, name in zip(photographs, names, strict=True)]
 
 
 def check_masks(photographs: Sequence[Photograph]) -> None:
@@ -141,8 +138,8 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
     masked = {each.mask: each for each in photographs if each.mask is not None}
     missing = [mask for mask in masked if not os.path.exists(mask)]
     if missing:
-        where = f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}"
-        fail(f"{where}. Put them there, or correct their names; {LEAVE_OUT}.")
+        which = f"{len(missing)} of {len(masked)} masks of the capture are missing: {listed(missing)}"
+        fail(f"{which}. Put them there, or correct their names; {LEAVE_OUT}.")
     sizes = in_threads(image_size, masked) if masked else []
     for (mask, photograph), known in zip(masked.items(), sizes, strict=True):
         size = known or checked_mask(mask).size  # fails with the reason

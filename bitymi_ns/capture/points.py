@@ -13,7 +13,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from bitymi_ns.capture.folder_contents import kind_of
-from bitymi_ns.capture.image_files import read_image
+from bitymi_ns.capture.image_files import WHITES, read_image, to_bytes
 from bitymi_ns.capture.kinds import CLOUDS
 from bitymi_ns.capture.types import CaptureError, Photograph, parsing, say
 from bitymi_ns.ply import read_header, read_rows
@@ -42,17 +42,13 @@ class Points(NamedTuple):
 
 
 def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.NDArray[np.uint8], str]:
-    """Convert colors [N, 3] to bytes. White is the smallest number that bounds them: 1 or 255 if `floating`, else 255
-    or 65535. Return [0, 3] and the reason if none does. Non-finite `values` become 0 in place."""
-    none = np.zeros((0, 3), np.uint8)
-    if not len(values):
-        return none, ""
+    """Convert colors [N, 3] to bytes, see `to_bytes`; without a usual white return [0, 3] and the reason. Non-finite
+    `values` become 0 in place."""
     values[~np.isfinite(values)] = 0.0
-    low, high = values.min(), values.max()
-    white = next((white for white in ((1.0, 255.0) if floating else (255.0, 65535.0)) if high <= white), None)
-    if white is None or low < 0.0:
-        return none, f"its colors lie between {low:g} and {high:g}, which is neither 0 to 1 nor 0 to 255 nor 0 to 65535"
-    return (values * (255.0 / white) + 0.5).astype(np.uint8), ""
+    try:
+        return to_bytes(values, WHITES[floating], "colors") if len(values) else values.astype(np.uint8), ""
+    except ValueError as error:
+        return np.zeros((0, 3), np.uint8), str(error)
 
 
 def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
@@ -66,7 +62,7 @@ def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
             raise ValueError(f"it gives no {' and no '.join(missing)} of its points (property float {missing[0]})")
         rows = read_rows(path, header, VERTEX)
     xyz = np.stack([rows[name] for name in "xyz"], -1).astype(np.float64)
-    colors = next((each for each in COLOR_NAMES if set(each) <= set(names)), None)
+    colors = next((color for color in COLOR_NAMES if set(color) <= set(names)), None)
     if colors is None:
         return Points(xyz, np.zeros((0, 3), np.uint8)), "its points have none"
     values = np.stack([rows[name] for name in colors], -1)
@@ -86,10 +82,10 @@ def share_on(cloud: Array, points: Array, centers: Array) -> float:
 
 
 def cloud_beside(
-    folder: Path, found: Points | None, photographs: Sequence[Photograph], placed: Callable[[Points], Points]
+    folder: Path, points: Points | None, photographs: Sequence[Photograph], placed: Callable[[Points], Points]
 ) -> Points | None:
-    """Read a PLY file in a folder that nothing names: the first on whose surfaces most of the points lie that were
-    `found` by triangulation; None = none. `placed` moves points of files to the poses' world. Report others."""
+    """Read a PLY file in a folder that nothing names: the first on whose surfaces most of the triangulated `points`
+    lie; None = none. `placed` moves points of files to the poses' world. Report others."""
     centers = np.stack([each.pose[:3, 3] for each in photographs])
     for path in sorted(path for path in folder.iterdir() if kind_of(path, CLOUDS)):
         try:
@@ -98,7 +94,7 @@ def cloud_beside(
             say(f"Not used: {error}")
             continue
         cloud = placed(cloud)
-        share = 0.0 if found is None or not len(cloud.xyz) else share_on(cloud.xyz, found.xyz, centers)
+        share = 0.0 if points is None or not len(cloud.xyz) else share_on(cloud.xyz, points.xyz, centers)
         why = f"{share:.0%} of the triangulated points lie on its surfaces"
         if share > SAME:
             say(f"Training starts from the points of {path}, which nothing names: {why}.")

@@ -3,6 +3,7 @@
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,6 +24,7 @@ NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orient
 """Entries of a transforms.json that only nerfstudio writes."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
 """Polycam's folders of images and cameras, the better ones first."""
+TWINS = ("nerfstudio", "instant-ngp")  # formats of one file name
 STRAY = ("odometry.csv", "camera_matrix.csv", "rgb.mp4")  # Stray Scanner's poses, camera, video
 SPLITS = ("transforms_train.json", "transforms_val.json", "transforms_test.json")  # files of a Blender data set
 INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
@@ -66,12 +68,11 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     folder = data if data.is_dir() else data.parent
     candidates = list(_in_folder(data) if data.is_dir() else _of_file(data))
     fitting: list[tuple[Format, Path]] = [each for each in candidates if format in ("auto", each[0])]
-    if data.is_dir() and all(found in ("photographs", "video") for found, _ in fitting):
+    if data.is_dir() and all(kind in ("photographs", "video") for kind, _ in fitting):
         if (within := _capture_within(data, format)) is not None:
             return recognise(within, format)
-    twins: dict[str, Format] = {"instant-ngp": "nerfstudio", "nerfstudio": "instant-ngp"}
-    if format != "auto" and format in twins and not fitting:  # the user knows better than the entries of the file
-        fitting = [(format, path) for found, path in candidates if found == twins[format]]
+    if format in TWINS and not fitting:  # the user knows better than the entries of the file
+        fitting = [(format, path) for kind, path in candidates if kind in TWINS]
     if not fitting:
         fail(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
@@ -87,12 +88,9 @@ def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | No
     """Find the only subfolder with poses, as unpacked archives have; None = none, several, or photographs beside it."""
     if folder_contents.photographs_in(folder):
         return None
-    found = [
-        path
-        for path in folder_contents.folders_in(folder)
-        if any(format in ("auto", each) for each, _ in (*_transforms_in(path), *_scanned(path)))
-    ]
-    return found[0] if len(found) == 1 else None
+    folders = [path for path in folder_contents.folders_in(folder)
+               if any(format in ("auto", kind) for kind, _ in (*_transforms_in(path), *_scanned(path)))]  # fmt: skip
+    return folders[0] if len(folders) == 1 else None
 
 
 def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
@@ -110,14 +108,11 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
 def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     """Yield a folder's captures in order of preference."""
     yield from _transforms_in(folder)
-    for model in models_in(folder):
-        yield "colmap", folder / model
+    yield from (("colmap", folder / model) for model in models_in(folder))
     yield from _scanned(folder)
-    photographs = _photographs_in(folder)
-    if photographs is not None:
+    if (photographs := _photographs_in(folder)) is not None:
         yield "photographs", photographs
-    for video in folder_contents.videos_in(folder):
-        yield "video", video
+    yield from (("video", video) for video in folder_contents.videos_in(folder))
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
@@ -147,17 +142,16 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
         yield "3d-scanner", folder
     if all((folder / name).is_file() for name in STRAY):
         yield "stray-scanner", folder
-    colour = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
-    if (colour and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
+    pictures = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
+    if (pictures and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
         yield "pose-files", folder
 
 
 def _kind_of(file: Path) -> Format:
     """Tell nerfstudio's transforms.json from instant-ngp's; unreadable ones are nerfstudio's, whose reader says so."""
-    try:
+    meta = None
+    with suppress(OSError, ValueError):
         meta = read_json(file)
-    except (OSError, ValueError):
-        return "nerfstudio"
     if not isinstance(meta, dict) or meta.keys() & NERFSTUDIOS_OWN:
         return "nerfstudio"
     if "aabb_scale" in meta:
@@ -176,17 +170,15 @@ def is_model(folder: Path) -> bool:
 def models_in(data: Path) -> list[Path]:
     """List COLMAP models at most three levels below a folder, relative to it: usual folders first, and of numbered
     models side by side (COLMAP writes several if it cannot connect all photographs) those with most images."""
-    found = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
-    models = [path.relative_to(data) for path in found if is_model(path)]
-    models = [model for model in models if not any(part.startswith(".") for part in model.parts)]
+    folders = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
+    models = [path.relative_to(data) for path in folders if is_model(path)]
 
-    def rank(model: Path) -> tuple[int, str, int, str]:
-        usual = [Path(name) for name in MODELS]
-        first = model.with_name("0") if model.name.isdigit() else model  # sparse/1 ranks as sparse/0 does
-        beside = usual.index(first) if first in usual else len(usual)
-        return beside, str(model.parent), -image_count(data / model), str(model)
+    def rank(model: Path) -> tuple[bool, int, str, int, str]:
+        first = str(model.with_name("0") if model.name.isdigit() else model)  # sparse/1 ranks as sparse/0 does
+        place = (first not in MODELS, MODELS.index(first) if first in MODELS else 0)
+        return *place, str(model.parent), -image_count(data / model), str(model)
 
-    return sorted(models, key=rank)
+    return sorted((model for model in models if not any(part[0] == "." for part in model.parts)), key=rank)
 
 
 def image_count(model: Path) -> int:
@@ -215,8 +207,8 @@ def _photographs_in(folder: Path) -> Path | None:
 def captures_in(folder: Path) -> list[Path]:
     """List the subfolders whose `images` hold photographs, as captures of their own; empty if there is only one."""
     folders = folder_contents.folders_in(folder)
-    found = [path for path in folders if any(folder_contents.photographs_below(path / "images"))]
-    return found if len(found) > 1 else []
+    captures = [path for path in folders if any(folder_contents.photographs_below(path / "images"))]
+    return captures if len(captures) > 1 else []
 
 
 def _colmap_given(data: Path, colmap_path: Path) -> Found:
@@ -225,26 +217,20 @@ def _colmap_given(data: Path, colmap_path: Path) -> Found:
     if is_model(model):
         return Found("colmap", model, folder)
     what = "has no cameras.bin or cameras.txt" if os.path.isdir(model) else "does not exist"
-    there = models_in(folder)
-    if not there:
-        fail(f"the COLMAP model {model} {what}, and there is none in other folders of {folder}.")
-    fail(f"the COLMAP model {model} {what}. Give `--colmap-path {there[0]}`.")
+    advice = "".join(f" Give `--colmap-path {path}`." for path in models_in(folder)[:1])
+    fail(f"the COLMAP model {model} {what}.{advice or f' There is none in other folders of {folder}.'}")
 
 
 def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> str:
     if format != "auto":
-        held = ", ".join(f"{_seen_from(path, data)} ({found})" for found, path in candidates[:3])
+        held = ", ".join(f"{_seen_from(path, data)} ({kind})" for kind, path in candidates[:3])
         there = f" It holds {held}: leave --format out." if candidates else ""
         return f"{data} holds nothing of the format {format}.{there}"
     if not data.is_dir():
-        if data.suffix.lower() in PHOTOGRAPHS:
-            return f"{data} is one photograph. A scene needs many: give the folder that holds them."
         if kind := folder_contents.kind_of(data, (*OTHERS, *UNREAD)):
             return f"{data} is {kind.what}: {kind.use}."
-        return (
-            f"{data} is no file that can be trained on. Give a folder of photographs, a video "
-            f"({', '.join(VIDEOS[:4])}, ...), a transforms.json, or the folder of a capture."
-        )
+        is_one = "is one photograph" if data.suffix.lower() in PHOTOGRAPHS else "is no file that can be trained on"
+        return f"{data} {is_one}. Give a folder of photographs, a video, a transforms.json, or a capture's folder."
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
     hint, several = "", captures_in(data)
@@ -253,12 +239,10 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         hint = f" It holds {len(several)} captures: give one of them, as {several[0]}."
     elif known:
         hint = f" {known[0][0]} is {known[0][1].what}: {known[0][1].use}."
-    elif others := folder_contents.passed_over(data):
-        hint = f" It holds what is not taken for photographs: {listed(others)}."
-    return (
-        f"{data} holds nothing to train on: no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), "
-        f"no photographs and no video.{folder_contents.unreadable_in(data) or hint}"
-    )
+    elif left := folder_contents.passed_over(data):
+        hint = f" It holds what is not taken for photographs: {listed(left)}."
+    lacks = "no transforms.json, no transforms_train.json, no COLMAP model (sparse/0), no photographs and no video"
+    return f"{data} holds nothing to train on: {lacks}.{folder_contents.unreadable_in(data) or hint}"
 
 
 def _seen_from(path: Path, folder: Path) -> str:

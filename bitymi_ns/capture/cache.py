@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from bitymi_ns import files, locks
-from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.capture.types import CaptureError, fail
 from bitymi_ns.files import Tell, write_file
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
@@ -48,7 +48,7 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
             check_no_links(folder.iterdir())
             lock = locks.Lock(folder / ".lock", tell=lambda text: None)
         except locks.Busy as error:
-            raise CaptureError(f"{kind} of {photographs} are being found already: {error}") from error
+            fail(f"{kind} of {photographs} are being found already: {error}", error)
         except OSError as error:
             if root == beside and isinstance(error, Refused):
                 tell(f"{error}. It is not used: the {kind} are kept in {cache or 'no place that is known'}.")
@@ -58,10 +58,8 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
             yield folder
         return
     assert problem is not None
-    raise CaptureError(
-        f"neither {beside} nor {cache or 'a cache folder'} can be written ({files.reason(problem, cache or beside)}): "
-        "set XDG_CACHE_HOME to a folder on a disk with space"
-    )
+    reason = files.reason(problem, cache or beside)
+    fail(f"neither {beside} nor {cache or 'a cache folder'} can be written ({reason}): set XDG_CACHE_HOME to a folder")
 
 
 def home(photographs: Path) -> Path:
@@ -92,22 +90,15 @@ def replace_stale(work: Path, photographs: Path, contents: str) -> None:
     of earlier contents. Keep those of other options, on which runs were trained, and those in use."""
     source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # relative: both may move
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
-    for other in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
-        if other != work and is_own(other) and _is_stale(other, source, contents):
-            with suppress(OSError), locks.Lock(other / ".lock", tell=lambda text: None):
-                shutil.rmtree(other, ignore_errors=True)
-
-
-def _is_stale(other: Path, source: str, contents: str) -> bool:
-    try:
-        of = read_json(other / OF)
-        if of["source"] != source or of["contents"] == contents:
-            return False
-        for mark in other.glob(f"{IN_USE}*"):
-            locks.Lock(mark, tell=lambda text: None).release()
-    except (OSError, ValueError, LookupError, TypeError):  # also a process that uses it
-        return False
-    return True
+    for folder in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
+        # an OSError may also be the lock of a process that uses it
+        with suppress(OSError, ValueError, LookupError, TypeError):
+            of = folder != work and is_own(folder) and read_json(folder / OF)
+            if of and of["source"] == source and of["contents"] != contents:
+                for mark in folder.glob(f"{IN_USE}*"):
+                    locks.Lock(mark, tell=lambda text: None).release()
+                with locks.Lock(folder / ".lock", tell=lambda text: None):
+                    shutil.rmtree(folder, ignore_errors=True)
 
 
 def keep_work_folder(work: Path) -> None:

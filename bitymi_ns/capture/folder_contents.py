@@ -6,6 +6,7 @@ import re
 import shlex
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
@@ -38,11 +39,9 @@ def open_picture(file: Path) -> Image.Image:
 
 def holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
     """Test if the first bytes of a file hold `mark`; False for unreadable files."""
-    try:
-        with open_regular(path) as file:
-            return mark in file.read(min(most, os.fstat(file.fileno()).st_size))
-    except OSError:
-        return False
+    with suppress(OSError), open_regular(path) as file:
+        return mark in file.read(min(most, os.fstat(file.fileno()).st_size))
+    return False
 
 
 @cache
@@ -56,10 +55,10 @@ def kind_of(path: Path, rows: Iterable[Kind], beside: Collection[str] = ()) -> K
     content; None = the table does not know it."""
     for row in rows:
         for form in (path.name.lower(), path.stem.lower()):
-            if found := _pattern(row.names).match(form):
-                name = next(filter(None, found.groups()), "")
-                whose = [each.replace("NAME", name) for each in row.of.split()]
-                there = any(each in beside or ("*" in each and fnmatch.filter(beside, each)) for each in whose)
+            if match := _pattern(row.names).match(form):
+                name = next(filter(None, match.groups()), "")
+                whose = [of.replace("NAME", name) for of in row.of.split()]
+                there = any(of in beside or ("*" in of and fnmatch.filter(beside, of)) for of in whose)
                 if (there or not whose) and (not row.mark or holds(path, row.mark.encode(), MOST_TEXT)):
                     return row
     return None
@@ -100,16 +99,16 @@ def _files(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, Kind | No
 def _left_out(parent: Path, below: Collection[str]) -> dict[str, Kind]:
     """Map the names of subfolders that are not searched to what they hold. Captures in subfolders beside photographs
     are left out, because they hold copies of these."""
-    names, found, captures = {name.lower() for name in below}, {}, []
+    names, left, captures = {name.lower() for name in below}, {}, []
     for path in sorted(parent / name for name in below):
         kind = HIDDEN if path.name.startswith(".") else kind_of(path, kinds.FOLDERS, names) or result_in(path)
         if kind:
-            found[path.name] = kind
+            left[path.name] = kind
         elif holds(path / "transforms.json", b'"transform_matrix"'):
             captures.append(path.name)
     if captures and (photographs_in(parent) or photographs_in(parent / "images")):
-        found |= dict.fromkeys(captures, OTHER)
-    return found
+        left |= dict.fromkeys(captures, OTHER)
+    return left
 
 
 def photographs_in(folder: Path) -> list[Path]:
@@ -168,26 +167,27 @@ def passed_over(
     # a folder of captures may hold a whole disk
     among = None if used is None else {above for path in used for above in path.parents}
     groups: dict[tuple[Kind | None, Path, str], list[Path]] = defaultdict(list)
-    found, known, masked = [], {*(used or ()), *masks}, {above for mask in masks for above in mask.parents}
+    described, known, masked = [], {*(used or ()), *masks}, {above for mask in masks for above in mask.parents}
     for path, kind in look_in(folder, among):
         if kind in kinds.OF_MASKS and (path if path.is_dir() else path.parent) in masked:
             continue
         if kind is not None and path.is_dir():
             count = sum(is_picture(each) and each not in known for each in path.rglob("*"))
             if count and not (copies and path.name.endswith(copies)):
-                found.append(f"{path.relative_to(folder)} ({kind.what}: {count}{_use(kind)})")
+                described.append(f"{path.relative_to(folder)} ({kind.what}: {count}{_use(kind)})")
         elif path not in known and (used is not None or kind is not None):
             groups[kind, path.parent, path.suffix.lower() if kind in kinds.UNREAD else ""].append(path)
     for (kind, parent, ending), paths in groups.items():
         if kind is None:
             own = (models or {}).get(parent) if all(path.parent != parent for path in known) else None
             whose = "nothing names" if own is None else f"belong to the model {own}"
-            found.append(f"pictures of {parent} that {whose} ({listed([path.name for path in paths], most=2)})")
+            described.append(f"pictures of {parent} that {whose} ({listed([path.name for path in paths], most=2)})")
         elif ending:
-            found.append(f"{len(paths)} {ending} of {parent} ({kind.what}, which is not read{_use(kind)})")
+            described.append(f"{len(paths)} {ending} of {parent} ({kind.what}, which is not read{_use(kind)})")
         else:
-            found.append(f"{listed([path.relative_to(folder) for path in paths], most=1)} ({kind.what}{_use(kind)})")
-    return found
+            first = listed([path.relative_to(folder) for path in paths], most=1)
+            described.append(f"{first} ({kind.what}{_use(kind)})")
+    return described
 
 
 def _use(kind: Kind) -> str:
@@ -201,8 +201,8 @@ def result_in(folder: Path) -> Kind | None:
     except OSError:  # unreadable folders are allowed
         return None
     rows = [row for row in kinds.RESULTS if row is not kinds.RENDERS or folder.name in kinds.SPLITS]
-    if found := next(filter(None, (kind_of(folder / name, rows) for name in names)), None):
-        return found
+    if row := next(filter(None, (kind_of(folder / name, rows) for name in names)), None):
+        return row
     pictures = [name for name in names if name.endswith((".jpg", ".png"))]
     if pictures and re.fullmatch(r"eval_img_\d{4,}\.png", pictures[-1]) and pictures[0].startswith("eval_"):
         return EVALUATED
@@ -212,33 +212,31 @@ def result_in(folder: Path) -> Kind | None:
 
 def images_of(model: Path) -> list[Path]:
     """List the folders of pictures that belong to a COLMAP model by the table, the likeliest first."""
-    path, found = os.path.abspath(model), ((_pattern(row.names), row.what) for row in kinds.IMAGES_OF)
-    matches = [(pattern.match(path), what) for pattern, what in found]
+    path = os.path.abspath(model)
+    matches = ((_pattern(row.names).match(path), row.what) for row in kinds.IMAGES_OF)
     folders = [what.replace("NAME", next(filter(None, match.groups()))) for match, what in matches if match]
     return [Path(os.path.normpath(model / os.path.relpath(each, path))) for each in folders]  # relative if `model` is
 
 
 def refusal(folder: Path) -> str:
     """Say why a folder cannot be trained on, and what to do, if it is a bundle or a run; empty = it can."""
-    what = result_in(folder) if folder.is_dir() else None
+    what, give = result_in(folder) if folder.is_dir() else None, "give the folder of its photographs"
     if what is kinds.BUNDLE:
-        bundle = f"{folder} is a bundle, not a capture: give the folder of its photographs."
-        return f"{bundle} `bitymi view {folder}` shows the bundle."
+        return f"{folder} is a bundle, not a capture: {give}. `bitymi view {folder}` shows the bundle."
     if what is kinds.RUN:
-        advice = f"give the folder of its photographs, and --load-dir {folder}/nerfstudio_models to go on with the run."
-        return f"{folder} is a training run, not a capture: {advice}"
+        return f"{folder} is a training run, not a capture: {give}; --load-dir {folder}/nerfstudio_models resumes it."
     return ""
 
 
 def poses_in(folder: Path) -> tuple[str, ...]:
     """Describe the files of poses in a folder and its subfolders, with what converts them."""
-    found: dict[Kind, list[Path]] = defaultdict(list)
+    files: dict[Kind, list[Path]] = defaultdict(list)
     for where in (folder, *sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")):
         for path in sorted(where.iterdir()) if os.access(where, os.R_OK) and not result_in(where) else ():
             if path.is_file() and (kind := kind_of(path, kinds.POSES)):
-                found[kind].append(path)
+                files[kind].append(path)
     described = []
-    for kind, paths in found.items():
+    for kind, paths in files.items():
         names, use = listed([path.relative_to(folder) for path in paths], most=1), _use(kind)
         for word, path in (("FILE", paths[0]), ("IMAGES", photo_folder(folder)), ("FOLDER", folder)):
             use = use.replace(word, shlex.quote(str(path)))

@@ -88,9 +88,8 @@ def move_to_world(
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
     names = [name for name in centers if name in local]
     placed, positions = np.array([centers[n] for n in names]), np.array([local[n] for n in names])
-    found = _by_gps(placed, positions)
-    if found is not None:
-        similarity, agree = found
+    if (by_gps := _by_gps(placed, positions)) is not None:
+        similarity, agree = by_gps
         source, by_phones = "gps", None if up is None else similarity.rotation.matrix() @ up
         if by_phones is not None and by_phones @ UP > STEEPEST:
             turn, _ = Rotation.align_vectors(UP, by_phones)  # the smallest one
@@ -113,10 +112,9 @@ def _gps_errors(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.n
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
     """Average the accelerometers' up [3] in the model's world; None unless three or more, and most of them, agree."""
     images = [image for image in model.images.values() if image.has_pose and image.name in ups]
-    found = [image.cam_from_world().rotation.matrix().T @ np.array(ups[image.name]) for image in images]
-    if len(found) < 3:
+    if len(images) < 3:
         return None
-    directions = np.array(found)
+    directions = np.array([image.cam_from_world().rotation.matrix().T @ ups[image.name] for image in images])
     agreeing = directions @ directions.T > SAME_UP  # [n, n]
     most = agreeing[np.argmax(agreeing.sum(axis=1))]
     if most.sum() < 3 or most.mean() <= 0.5:
@@ -137,10 +135,10 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
     options = pycolmap.RANSACOptions(random_seed=0)
     for error in AGREEMENTS:  # the least within which half agree: others may be of another flight
         options.max_error = error
-        found = pycolmap.estimate_sim3d_robust(centers, positions, options)
-        if found is None:
+        result = pycolmap.estimate_sim3d_robust(centers, positions, options)
+        if result is None:
             continue
-        similarity = found["tgt_from_src"] if isinstance(found, dict) else found  # as pycolmap 4.1 and 4.2 have it
+        similarity = result["tgt_from_src"] if isinstance(result, dict) else result  # as pycolmap 4.1 and 4.2 have it
         errors = _gps_errors(similarity, centers, positions)
         if 2 * (errors <= error).sum() >= len(errors):
             agree = errors <= 2 * error  # with those that noise puts farther away
@@ -156,15 +154,13 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
 def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray | None) -> pycolmap.Sim3d:
     """Make the similarity that turns `up` (None = the cameras' mean) to z, moves the cameras' mean position to the
     origin, and scales their mean distance from it to 1."""
-    turns = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
+    turns = np.array([image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose])
+    side, down, _ = turns.mean(0)
     axis = up
     if axis is None:
-        axis = -np.mean([turn[1] for turn in turns], axis=0)
-        if np.linalg.norm(axis) < 0.1:  # the cameras' ups cancel
-            axis = -turns[0][1]
-        axis /= np.linalg.norm(axis)
-    side = np.mean([turn[0] for turn in turns], axis=0)
-    side -= axis * (axis @ side)
+        axis = -down if np.linalg.norm(down) >= 0.1 else -turns[0, 1]  # the cameras' ups may cancel
+        axis = axis / np.linalg.norm(axis)
+    side = side - axis * (axis @ side)
     if np.linalg.norm(side) < 1e-3:
         side = np.cross(axis, [1.0, 0, 0] if abs(axis[0]) < 0.9 else [0, 1.0, 0])
     side /= np.linalg.norm(side)

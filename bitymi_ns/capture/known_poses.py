@@ -18,7 +18,7 @@ from bitymi_ns.capture.points import Points
 from bitymi_ns.capture.sfm import process
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.sfm_photos import check_names, is_plain
-from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, say, warn
+from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, fail, say, warn
 from bitymi_ns.files import Tell
 from bitymi_ns.progress import Progress, no_progress, rich_progress
 
@@ -35,7 +35,7 @@ def triangulate(
     wrong; KeyboardInterrupt: Ctrl-C; what is done is kept."""
     check_photographs_exist(capture, [view.file for view in views])
     if len(views) < 2:
-        raise CaptureError(f"{capture}: points need at least two photographs with poses, these are {len(views)}")
+        fail(f"{capture}: points need at least two photographs with poses, these are {len(views)}")
     names = [os.path.relpath(view.file, capture) for view in views]
     check_names(capture, names)
     masks = [view.mask for view in views if view.mask is not None and os.path.isfile(view.mask)]
@@ -59,17 +59,16 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     mirrored = [bool(np.linalg.det(photograph.pose[:3, :3]) < 0.0) for photograph in photographs]
     mirror = MIRROR if all(mirrored) else np.eye(3)  # undoes mirrored poses: the photographs are not mirrored
     views = []
-    for photograph in photographs:
-        camera = photograph.camera
-        stored = (photograph.downscaled and image_size(photograph.file)) or camera.size
-        pose = photograph.pose.copy()
+    for view in photographs:
+        stored = (view.downscaled and image_size(view.file)) or view.camera.size
+        pose = view.pose.copy()
         pose[:3] = mirror @ (pose[:3] - np.pad(middle[:, None], ((0, 0), (3, 0))))
-        views.append(replace(photograph, camera=camera.rescaled(*stored), pose=pose))
+        views.append(replace(view, camera=view.camera.rescaled(*stored), pose=pose))
     without = "`bitymi-data --points random`"
     say(f"{source} has no points: they are triangulated from the photographs, once. {without} does without.")
     try:
         if any(mirrored) and not all(mirrored):
-            raise CaptureError("some poses are mirrored against the others")
+            fail("some poses are mirrored against the others")
         with rich_progress() as progress:
             model = read_model(triangulate(folder, views, progress, warn))
     except CaptureError as error:

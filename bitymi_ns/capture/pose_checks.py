@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,8 +47,7 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
         ("is sheared or stretched: its columns are not at right angles and equally long", usable & (error > ROUNDED)),
     ):
         if wrong.any():
-            part = f"the 3 x 3 part of the pose of {named(wrong)} is no rotation, it {what}"
-            fail(f"{source}: {part}. Correct the pose or remove the frame.")
+            fail(f"{source}: the 3 x 3 part of the pose of {named(wrong)} {what}. Correct it or remove the frame.")
     scaled = np.abs(scale - 1.0) > EXACT
     result[scaled] = unit[scaled]
     rounded = error > EXACT
@@ -56,10 +56,8 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
     if scaled.any():
         low, high = scale[scaled].min(), scale[scaled].max()
         factor = f"{low:.4g}" if high - low <= EXACT * high else f"{low:.4g} to {high:.4g}"
-        then = "The factor is divided out; positions stay as they are."
-        warn(f"{source}: rotations are scaled by {factor} in the poses of {named(scaled)}. {then}")
-    only_rounded = rounded & ~scaled
-    if only_rounded.any():
+        warn(f"{source}: rotations are scaled by {factor} in the poses of {named(scaled)}. It is divided out.")
+    if (only_rounded := rounded & ~scaled).any():
         off = f"rotations are off by up to {error[only_rounded].max():.1g} in the poses of {named(only_rounded)}"
         warn(f"{source}: {off}. The nearest ones are used.")
     return result
@@ -72,15 +70,13 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
     for frame, name in zip(frames, names, strict=True):
         pose = as_matrix(frame["transform_matrix"])
         if pose is None:
-            what = f"the transform_matrix of {name} is not a matrix of 4 x 4 finite numbers"
-            fail(f"{path}: {what}. Correct it or remove the frame.")
+            fail(f"{path}: the transform_matrix of {name} is not 4 x 4 finite numbers. Correct it or remove the frame.")
         if pose[3, 3] and not pose[3, :3].any():
             scaled += [name] * bool(abs(pose[3, 3] - 1.0) > 1e-6)  # numpy 2.5 multiplies no list by its own
             pose = pose / pose[3, 3]  # homogeneous: a factor on all 16 numbers says nothing
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
-            row = " ".join(f"{x:g}" for x in pose[3])
-            why = "A matrix whose position stands in its last row has to be transposed."
-            fail(f"{path}: the last row of the transform_matrix of {name} is {row}, not 0 0 0 1. {why}")
+            what = f"the last row of the transform_matrix of {name} is {' '.join(f'{x:g}' for x in pose[3])}"
+            fail(f"{path}: {what}, not 0 0 0 1. If its position stands there, transpose the matrix.")
         poses.append(pose)
     if scaled:
         say(f"{path}: the transform_matrix of {listed(scaled)} is divided by its last number, which is not 1.")
@@ -97,13 +93,11 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
 
 def as_matrix(value: Any) -> np.ndarray | None:
     """Convert 3 x 4 or 4 x 4 finite numbers to [4, 4]; else None."""
-    try:
+    with suppress(ValueError, TypeError, OverflowError):
         matrix = np.asarray(value, dtype=np.float64)
-    except (ValueError, TypeError, OverflowError):
-        return None
-    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        return None
-    return matrix if len(matrix) == 4 else np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+        if matrix.shape in ((3, 4), (4, 4)) and np.isfinite(matrix).all():
+            return np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])[:4]
+    return None
 
 
 def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
@@ -111,10 +105,8 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
     mirrored = np.linalg.det(rotations) < 0.0
     few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
     if few.any():
-        warn(
-            f"{listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames (the sign of the "
-            "pose's determinant differs). If the photograph is not mirrored, too, the pose is wrong."
-        )
+        which = f"{listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames"
+        warn(f"{which} (by the pose's determinant). If the photograph is not mirrored, too, the pose is wrong.")
 
 
 def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
@@ -127,19 +119,16 @@ def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) ->
     """Warn of single cameras far from all others, or fail; centers [N, 3] finite, `names` for messages."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     order = np.argsort(distances)
-    sorted_distances = distances[order]
-    first = len(order) - max(1, len(order) // 10)  # more than a tenth is a group of its own
-    for k in range(max(1, first), len(order)):
-        near, far = sorted_distances[k - 1], sorted_distances[k]
-        if near <= 0.0 or far < FAR * near:
-            continue
-        away = f"{far / near:,.0f} times as far from the middle of the capture as the others"
-        message = f"the camera of {listed([names[i] for i in order[k:]])} is {away}."
-        if far < TOO_FAR * near:
-            warn(f"{message[0].upper()}{message[1:]} If that is a mistake, correct the pose or remove the frame.")
-        else:
-            fail(f"{message} Beside it they are all at one place. Correct the pose or remove the frame.")
-        return
+    near, far = distances[order][:-1], distances[order][1:]
+    apart = np.flatnonzero((near > 0.0) & (far >= FAR * near)) + 1
+    apart = apart[apart >= len(order) - max(1, len(order) // 10)]  # more than a tenth is a group of its own
+    if len(apart):
+        k = apart[0]
+        times = f"{far[k - 1] / near[k - 1]:,.0f} times as far from the middle of the capture as the others"
+        message = f"the camera of {listed([names[i] for i in order[k:]])} is {times}"
+        if far[k - 1] >= TOO_FAR * near[k - 1]:
+            fail(f"{message}: beside it they are all at one place. Correct the pose or remove the frame.")
+        warn(f"T{message[1:]}. If that is a mistake, correct the pose or remove the frame.")
 
 
 def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
@@ -159,8 +148,7 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
         return frame
     scale = frame.scale_factor * USUAL_SPREAD / ratio
     usual = f"where those of this format usually lie {USUAL_SPREAD * frame.scene_scale / frame.scale_factor:.2g}"
-    more = f"the capture is scaled by {scale:.3g}. Bundles state that."
-    say(f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual}: {more}")
+    say(f"The cameras of {source} lie {spread:,.4g} units from their middle, {usual}: they are scaled by {scale:.3g}.")
     return replace(frame, scale_factor=scale)
 
 
@@ -181,6 +169,5 @@ def check_point_unit(
     picture = np.median(np.linalg.norm(centers - cloud_middle, axis=1) * widths)  # picture width at the cloud
     far, near = away > OTHER_UNIT * apart > 0.0, 0.0 < spread < picture / OTHER_UNIT
     if far or near:
-        where = "far beyond the cameras" if far else "in a spot of the pictures"
-        hint = "Give the points in the unit of the poses, or remove the cloud to start from random points."
-        warn(f"The point cloud seems to be in another unit than the poses: half of its points lie {where}. {hint}")
+        what = f"half of the points lie {'far beyond the cameras' if far else 'in a spot of the pictures'}"
+        warn(f"The point cloud seems to be in another unit than the poses: {what}. Correct or remove it.")

@@ -7,12 +7,13 @@ import time
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, fields, replace
 from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from bitymi_ns.capture import pycolmap, sfm_photos
+from bitymi_ns.capture import pycolmap, sfm_photos, types
 from bitymi_ns.capture.cache import content_key, emptied, replace_stale, work_folder
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.folder_contents import passed_over, photo_folder, refusal, unreadable_in, videos_in
@@ -22,9 +23,10 @@ from bitymi_ns.capture.masks import find_masks, mask_folder, write_colmap_masks
 from bitymi_ns.capture.recognise import is_model
 from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
+from bitymi_ns.capture.sfm.explain import SHOOT
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
 from bitymi_ns.capture.sfm_photos import Photo
-from bitymi_ns.capture.types import SPHERICAL_MODEL, CaptureError, ColmapCamera, FoundPoses, SfmOptions, is_full_sphere
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, FoundPoses, SfmOptions, fail, is_full_sphere
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file
 from bitymi_ns.progress import Progress, no_progress
@@ -61,25 +63,24 @@ def find_poses(
         masks, _ = find_masks(names, folder, where, options.masks is not None)
         if not masks and where is not None:
             advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out"
-            raise CaptureError(f"no mask in {where} belongs to a photograph: {advice} (--use-masks False)")
+            fail(f"no mask in {where} belongs to a photograph: {advice} (--use-masks False)")
     if source.is_dir():
-        others = passed_over(source, masks=masks.values())
+        left = passed_over(source, masks=masks.values())
     else:
-        others = [f"{film.name} ({FILM.what})" for film in videos_in(source.parent, rendered=True)]
-    if others:
-        warn(f"Not taken for photographs in {source}: {listed(others, most=12)}.")
+        left = [f"{film.name} ({FILM.what})" for film in videos_in(source.parent, rendered=True)]
+    if left:
+        warn(f"Not taken for photographs in {source}: {listed(left, most=12)}.")
     inputs = [(name, folder / name) for name in names] or [(source.name, source)]
     inputs += [(f"masks/{name}", path) for name, path in masks.items()]
     settings = {**asdict(options), "masks": bool(masks)}
     del settings["use_masks"]
     with work_folder(folder, content_key(inputs, settings), warn) as work:
-        finished = _finished(work, folder)
-        if finished is not None:
-            return finished
-        with write_errors_as(work, CaptureError):
-            found = _find(source, folder, names, masks, options, warn, work, tell)
-            replace_stale(work, folder, content_key(inputs, "contents"))
-            return found
+        poses = _finished(work, folder)
+        if poses is None:
+            with write_errors_as(work, types.CaptureError):
+                poses = _find(source, folder, names, masks, options, warn, work, tell)
+                replace_stale(work, folder, content_key(inputs, "contents"))
+        return poses
 
 
 def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
@@ -87,11 +88,11 @@ def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
     if source.suffix.lower() in VIDEOS and source.is_file():
         return source, source, []
     if not source.exists():
-        raise CaptureError(f"{source} does not exist: name a folder of photographs, or a video")
+        fail(f"{source} does not exist: name a folder of photographs, or a video")
     if why := refusal(source):
-        raise CaptureError(why)
+        fail(why)
     if not source.is_dir():
-        raise CaptureError(f"{source} is neither a folder of photographs nor a video ({', '.join(VIDEOS)})")
+        fail(f"{source} is neither a folder of photographs nor a video ({', '.join(VIDEOS)})")
     folder = photo_folder(source)
     names = sfm_photos.find_photos(folder)
     videos = videos_in(source)
@@ -99,11 +100,8 @@ def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
         return videos[0], videos[0], []
     if len(names) < LEAST:
         also = f" Of its {len(videos)} videos, name one." if videos and not names else ""
-        held = {0: "no photographs", 1: "one photograph"}.get(len(names), f"{len(names)} photographs")
-        raise CaptureError(
-            f"{folder} holds {held}: camera poses need at least {LEAST}, and a scene 20 to 200. Walk round it and take "
-            f"photographs of which each shares at least two thirds with the one before.{unreadable_in(source) or also}"
-        )
+        needs = f"camera poses need at least {LEAST}, and a scene 20 to 200. {SHOOT}"
+        fail(f"{folder} holds {len(names) or 'no'} photographs: {needs}.{unreadable_in(source) or also}")
     below = os.path.commonpath([f"./{os.path.dirname(name)}" for name in names])  # as if their common folder were given
     return source, folder / below, [os.path.relpath(name, below) for name in names]
 
@@ -111,16 +109,15 @@ def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
 def _finished(work: Path, folder: Path) -> FoundPoses | None:
     """Read an earlier run's poses by poses.json, which marks complete results; None = none, or damaged ones."""
     result = work / "result"
-    try:
+    with suppress(OSError, ValueError, LookupError, AttributeError, TypeError):  # damaged in any way
         kept = read_json(result / "poses.json")
         made = kept.pop("made")  # photographs of the model are copies or frames in the work folder
         images = work / sfm_photos.IMAGES if made else Path(os.path.abspath(folder))
         values = {**kept, "model": result / SPARSE, "images": images, "report": result}
         poses = TypeAdapter(FoundPoses).validate_python(values)
-    except Exception:  # damaged in any way
-        return None
-    whole = images.is_dir() and all(path.exists() for path in images.rglob("*")) if made else True
-    return poses if whole and is_model(result / SPARSE) else None
+        whole = not made or (images.is_dir() and all(path.exists() for path in images.rglob("*")))
+        return poses if whole and is_model(result / SPARSE) else None
+    return None
 
 
 def _find(
@@ -135,11 +132,10 @@ def _find(
 ) -> FoundPoses:
     begun = time.monotonic()
     seconds: dict[str, float] = {}
-    given, video = len(names), not names
-    if video:
+    if video := not names:
         folder = extract_frames(source, work, options.frames, tell)
         names = sfm_photos.find_photos(folder)
-        given, seconds["taking frames"] = len(names), time.monotonic() - begun
+        seconds["taking frames"] = time.monotonic() - begun
     read = time.monotonic()
     photos, left_out = sfm_photos.read_photos(folder, names, tell)
     photos = _with_panoramas(folder, photos, left_out, options.camera_model, warn)
@@ -150,13 +146,11 @@ def _find(
     if len(photos) < LEAST:
         alike = len(twins) >= len(left_out) - len(twins)
         if video and alike:
-            raise CaptureError(f"{source} {NO_MOTION}")
-        some = listed([f"{name}: {why}" for name, why in left_out.items()])
-        use, then = "can be used", "copy or export them again"
-        if alike:
-            use, then = "differ", "take photographs from different places"
+            fail(f"{source} {NO_MOTION}")
+        reasons = listed([f"{name}: {why}" for name, why in left_out.items()])
         whose = f"frames of {source}" if video else f"photographs in {folder}"
-        raise CaptureError(f"of the {whose}, only {len(photos)} {use} ({some}): {then}")
+        use, then = ("differ", "take some from different places") if alike else ("can be used", "copy them again")
+        fail(f"of the {whose}, only {len(photos)} {use} ({reasons}): {then}")
     photos = ordered(photos)
     started = time.monotonic()
     images, used = sfm_photos.upright_photos(photos, folder, work, tell)
@@ -168,7 +162,7 @@ def _find(
     notes |= {photo.name: f"focal length in EXIF not used: {photo.exif.doubt}" for photo in photos if photo.exif.doubt}
     seconds |= result.pop("seconds")
     seconds["all"] = time.monotonic() - begun
-    values = {"source": str(source), "given": given, "left_out": left_out, "notes": notes, "seconds": seconds}
+    values = {"source": str(source), "given": len(names), "left_out": left_out, "notes": notes, "seconds": seconds}
     return _write(work, images, {**values, **result}, photos, job)
 
 
@@ -187,20 +181,16 @@ def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str],
             model == "auto" and (closed or len(told) >= TELLING * len(alike) > 0.0)
         )
         if model == "auto" and len(told) not in (0, len(alike)):
-            kinds = ("360-degree pictures", "photographs")[:: 1 if decided[key] else -1]
+            kind = "360-degree pictures" if decided[key] else "photographs"
             other = "SIMPLE_RADIAL" if decided[key] else SPHERICAL_MODEL
-            warn(
-                f"{len(told)} of {len(alike)} photographs of {key[1]} x {key[2]} pixels in {source / key[0]} look like "
-                f"360-degree pictures: all are read as {kinds[0]}. `bitymi-data --sfm.camera-model {other}` reads all "
-                f"as {kinds[1]}."
-            )
+            which = f"{len(told)} of {len(alike)} photographs of {key[1]} x {key[2]} pixels in {source / key[0]}"
+            advice = f"If they are not: `bitymi-data --sfm.camera-model {other}`."
+            warn(f"{which} look like 360-degree pictures: all are read as {kind}. {advice}")
     photos = [replace(p, panorama=decided[os.path.dirname(p.name), p.width, p.height]) for p in photos]
     partial = [photo.name for photo in photos if photo.panorama and not is_full_sphere(photo.width, photo.height)]
     if len(partial) > len(photos) / 2:
-        raise CaptureError(
-            f"{len(partial)} of {len(photos)} photographs of {source} are panoramas ({', '.join(partial[:3])}), which "
-            "can be used only if they show all directions, twice as wide as high. Take single photographs instead."
-        )
+        which = f"{len(partial)} of {len(photos)} photographs of {source} are panoramas ({', '.join(partial[:3])})"
+        fail(f"{which} that do not show all directions, twice as wide as high. Take single photographs instead.")
     left_out |= dict.fromkeys(partial, "a panorama, but not of all directions (twice as wide as high)")
     return [photo for photo in photos if photo.name not in left_out]
 
@@ -283,6 +273,6 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
         write_report(result, values, model)
         write_file(result / "poses.json", json.dumps({"made": images == work / sfm_photos.IMAGES, **kept}).encode())
     process.delete_work(work, "links", "masks", MODEL)
-    found = _finished(work, images)
-    assert found is not None
-    return found
+    poses = _finished(work, images)
+    assert poses is not None
+    return poses

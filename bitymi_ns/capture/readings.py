@@ -129,8 +129,8 @@ def match_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
         elif len(_mutual(features[i][1][:COARSE], features[j][1][:COARSE])) >= ALIKE:
             wide.append((i, j))
     rng, pairs, tried = np.random.default_rng(0), [], []
-    for step, some in ((1, near), (2, wide)):
-        tried += [(k * step, *some[i]) for k, i in enumerate(rng.permutation(len(some)))]
+    for step, candidates in ((1, near), (2, wide)):
+        tried += [(k * step, *candidates[i]) for k, i in enumerate(rng.permutation(len(candidates)))]
     for _, i, j in sorted(tried)[:TRIALS]:
         if len(pairs) < PAIRS:
             pairs += _match([each.camera for each in photographs], order[i], order[j], features[i], features[j])
@@ -140,20 +140,19 @@ def match_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
 def _features(photograph: Photograph) -> Features:
     """Find SIFT features, the largest first, with square roots of the histograms as descriptors (Arandjelovic and
     Zisserman, 2012); none if the photograph cannot be read, or not with its camera, which is reported later."""
-    camera, found, mask = photograph.camera, (), np.empty(0, np.uint8)
-    side = SIDE * (2 if camera.model == SPHERICAL_MODEL else 1)
-    size = camera.within(side)
+    camera, points, mask = photograph.camera, (), np.empty(0, np.uint8)
+    size = camera.within(SIDE * (2 if camera.model == SPHERICAL_MODEL else 1))
     with suppress(CaptureError):
         image = np.asarray(read_image(photograph.file, wanted=size).convert("L"))
         if photograph.mask is not None:
             mask = np.asarray(checked_mask(photograph.mask).resize(size), np.uint8)
         if in_proportion(image_size(photograph.file) or (0, 1), camera.size):
-            found, values = cv2.SIFT.create(FEATURES, contrastThreshold=0.02).detectAndCompute(image, mask)
-    if not found:
+            points, values = cv2.SIFT.create(FEATURES, contrastThreshold=0.02).detectAndCompute(image, mask)
+    if not points:
         return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    largest = np.argsort([-each.size for each in found], kind="stable")
+    largest = np.argsort([-point.size for point in points], kind="stable")
     values = np.sqrt(values[largest] / np.maximum(values[largest].sum(1, keepdims=True), 1e-6))
-    return (np.array([each.pt for each in found])[largest] + 0.5) * np.divide(camera.size, size), values
+    return (np.array([point.pt for point in points])[largest] + 0.5) * np.divide(camera.size, size), values
 
 
 def _mutual(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
@@ -161,13 +160,13 @@ def _mutual(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArr
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), np.int64)
     cosine = a @ b.T
-    rows, there = np.arange(len(a)), cosine.argmax(1)
-    mutual = cosine.argmax(0)[there] == rows
-    best = cosine[rows, there]
-    cosine[rows[mutual], there[mutual]] = -1.0
-    second = np.maximum(cosine.max(1), cosine.max(0)[there])
+    rows, nearest = np.arange(len(a)), cosine.argmax(1)
+    mutual = cosine.argmax(0)[nearest] == rows
+    best = cosine[rows, nearest]
+    cosine[rows[mutual], nearest[mutual]] = -1.0
+    second = np.maximum(cosine.max(1), cosine.max(0)[nearest])
     kept = mutual & (1.0 - best < RATIO**2 * (1.0 - second))
-    return np.stack([rows[kept], there[kept]], 1)
+    return np.stack([rows[kept], nearest[kept]], 1)
 
 
 def _match(cameras: Sequence[ColmapCamera], i: int, j: int, a: Features, b: Features) -> list[Pair]:
@@ -181,8 +180,8 @@ def _match(cameras: Sequence[ColmapCamera], i: int, j: int, a: Features, b: Feat
         return []
     options = pycolmap.RANSACOptions(max_num_trials=SAMPLES, random_seed=0)
     options.max_error = TOLERANCE * max(cameras[i].size)
-    found = pycolmap.estimate_essential_matrix(x, y, cameras[i].colmap, cameras[j].colmap, options)
-    pair = [] if found is None else [Pair(i, j, x, y, found["cam2_from_cam1"].matrix())]
+    essential = pycolmap.estimate_essential_matrix(x, y, cameras[i].colmap, cameras[j].colmap, options)
+    pair = [] if essential is None else [Pair(i, j, x, y, essential["cam2_from_cam1"].matrix())]
     return pair if explained(pair, rays_of(pair, cameras)).sum() >= max(LEAST, OWN * len(x)) else []
 
 
@@ -239,8 +238,8 @@ def decide(photographs: Sequence[Photograph], poses: Array, written: Reading) ->
     for kinds in ([""], [*INTRINSICS, SWAPPED, NO_DISTORTION]):
         for kind in kinds:
             rays = rays_of(pairs, [camera_as(camera, kind) for camera in cameras])
-            some = [each for each in every if each.intrinsics == kind]
-            counts |= {each: explained(pairs, rays, read_as(poses, written, each)[0]) for each in some}
+            counts |= {reading: explained(pairs, rays, read_as(poses, written, reading)[0])
+                       for reading in every if reading.intrinsics == kind}  # fmt: skip
         best = max(counts, key=lambda each: counts[each].sum())
         share, as_written, most = (float(each.sum() / total) for each in (counts[best], counts[written], own))
         if share >= max(FITS * most, LEAD * as_written):
@@ -267,22 +266,20 @@ def as_meant(
     if asked == AUTO:
         decision = decide(photographs, poses, written)
     elif decision.reading is None:
-        some = [each.name for each in named.values() if not each.turn and not each.intrinsics]
-        fail(f"--poses-as is {asked}, but {source} can be read as {AUTO}, {WRITTEN}, or as {', '.join(some[1:])}.")
+        usual = [known.name for known in named.values() if not known.turn and not known.intrinsics]
+        fail(f"--poses-as is {asked}, but {source} can be read as {AUTO}, {WRITTEN}, or as {', '.join(usual[1:])}.")
     reading, explains = decision.reading, "of what pairs of photographs have in common"
     if reading is None:
         folder = shlex.quote(os.path.commonpath([os.path.abspath(each.file.parent) for each in photographs]))
-        warn(
-            f"{source}: the poses fit the photographs badly: they explain {decision.written:.0%} {explains}, where "
-            f"{decision.own:.0%} can be; least in {listed(decision.worst)}. `bitymi sfm {folder}` finds others."
-        )
+        least = f"where {decision.own:.0%} can be; least in {listed(decision.worst)}"
+        bad = f"the poses fit the photographs badly: they explain {decision.written:.0%} {explains}, {least}"
+        warn(f"{source}: {bad}. `bitymi sfm {folder}` finds others.")
     if reading is None or reading == written:
         return list(photographs), np.eye(4), WRITTEN
     if asked == AUTO:
-        warn(
-            f"{source}: the poses are read as {reading.name}, which explains {decision.share:.0%} {explains}; as "
-            f"written ({written.name}), {decision.written:.0%}. `bitymi-data --poses-as {WRITTEN}` keeps those."
-        )
+        read_as_meant = f"the poses are read as {reading.name}, which explains {decision.share:.0%} {explains}"
+        as_written = f"as written ({written.name}), {decision.written:.0%}"
+        warn(f"{source}: {read_as_meant}; {as_written}. `bitymi-data --poses-as {WRITTEN}` keeps those.")
     meant, world = read_as(poses, written, reading)
     photographs = [replace(each, pose=frame @ pose, camera=camera_as(each.camera, reading.intrinsics))
                    for each, pose in zip(photographs, meant, strict=True)]  # fmt: skip

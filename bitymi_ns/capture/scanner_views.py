@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.depth_normal_maps import MapFiles, maps_beside, maps_called
 from bitymi_ns.capture.folder_contents import photographs_in
-from bitymi_ns.capture.image_files import image_size, in_proportion
+from bitymi_ns.capture.image_files import image_size, in_proportion, wrong_size
 from bitymi_ns.capture.order import natural
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
@@ -49,8 +49,7 @@ def scanner_photographs(found: Found) -> list[Photograph]:
     for row in rows:
         sides = row.size or ()
         if not np.isfinite([*row.pose.ravel(), *row.pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in sides):
-            bad = f"the pose or camera of {row.file.name} is not finite, or its picture has no pixels"
-            fail(f"{what} is damaged: {bad}. {AGAIN}")
+            fail(f"{what} is damaged: the pose, camera or size of {row.file.name} is no finite number. {AGAIN}")
     if len(rows) < 2:
         fail(f"{what} has {len(rows)} photographs with poses: a scene needs many.")
     files = [row.file for row in rows]
@@ -62,8 +61,7 @@ def scanner_photographs(found: Found) -> list[Photograph]:
         size = image_size(path) or stated or (1, 1)
         camera = ColmapCamera("PINHOLE", *(stated or size), pinhole)
         if not in_proportion(camera.size, size):
-            there, size_of = "{} x {}".format(*size), f"{camera.width} x {camera.height}, which is another shape"
-            fail(f"{path} has {there} pixels, but its camera is for {size_of}. Export it again.")
+            fail(wrong_size(path, size, camera.size))
         result.append(Photograph(path, camera.rescaled(*size), pose, f"the camera of {path}", maps=own or beside))
     return result
 
@@ -96,9 +94,9 @@ def _record3d(folder: Path) -> list[ScannedPhotograph]:
         poses: Sequence[Any] = list(values["poses"])
     files = _images(folder, "rgb", "rgbd", "images")
     rows = []
-    for i, each in enumerate(poses):
+    for i, numbers in enumerate(poses):
         with parsing(f"{path}: pose {i} (counted from 0)", AGAIN):
-            pose = _pose(_numbers(each, 7))
+            pose = _pose(_numbers(numbers, 7))
             pinhole = tuple(_numbers(own[i][:4], 4)) if i < len(own) else camera
         if str(i) in files:  # Record3D can export every n-th image
             rows.append(ScannedPhotograph(files[str(i)], Y_UP @ pose, pinhole, size))
@@ -106,8 +104,7 @@ def _record3d(folder: Path) -> list[ScannedPhotograph]:
 
 
 def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
-    """Read 3D Scanner App's frames: frame_00012.json with camera to world and camera matrix, both row-major; beside it
-    depth, confidence and, for some frames, a picture."""
+    """Read 3D Scanner App's frames: JSON files of row-major matrices; for some a picture, depth and confidence."""
     rows, pictures = [], _images(folder)
     for path in sorted(folder.glob("frame_*.json"), key=lambda path: natural(path.name)):
         if path.stem not in pictures:
@@ -116,15 +113,13 @@ def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
             values = read_json(path)
             pose: Pose = np.array(_numbers(values["cameraPoseARFrame"], 16)).reshape(4, 4)
             fx, _, cx, _, fy, cy, *_ = _numbers(values["intrinsics"], 9)
-        number = path.stem.removeprefix("frame_")
-        maps = maps_called(folder, f"depth_{number}", f"conf_{number}")
+        maps = maps_called(folder, *(path.stem.replace("frame", kind) for kind in ("depth", "conf")))
         rows.append(ScannedPhotograph(pictures[path.stem], Y_UP @ pose, (fx, fy, cx, cy), maps=maps))
     return rows
 
 
 def _stray_scanner(folder: Path) -> list[ScannedPhotograph]:
-    """Read Stray Scanner's camera matrix, video (without near-duplicate frames) and poses: positions and quaternions
-    xyzw in ARKit's world, cameras with OpenCV axes."""
+    """Read Stray Scanner's camera matrix, video and poses: positions and quaternions xyzw, with OpenCV axes."""
     from bitymi_ns.capture.video import frames_with_poses  # slow to import
 
     odometry, matrix, video = (folder / name for name in STRAY)
@@ -149,8 +144,7 @@ def _stray_scanner(folder: Path) -> list[ScannedPhotograph]:
 
 
 def _pose_files(folder: Path) -> list[ScannedPhotograph]:
-    """Read images in `color` or `rgb` and 4 x 4 matrices, camera to world with OpenCV axes, of the same names in
-    `pose`; or both in one folder, as NAME.color.png and NAME.pose.txt. A matrix that is not finite means no pose."""
+    """Read color/NAME.png with pose/NAME.txt, or NAME.color.png with NAME.pose.txt: 4 x 4, OpenCV axes, NaN = none."""
     pinhole = _intrinsics(folder)
     files = {stem.removesuffix(".color"): file for stem, file in _images(folder, "color", "rgb", "images").items()}
     poses, rows, lost = folder / "pose" if (folder / "pose").is_dir() else folder, [], []
@@ -170,16 +164,13 @@ def _pose_files(folder: Path) -> list[ScannedPhotograph]:
 
 
 def _intrinsics(folder: Path) -> tuple[float, ...]:
-    """Read fx, fy, cx, cy of all photographs from the first known file name: a matrix, also in one line; four numbers;
-    or NSVF's, whose first line is f, cx and cy."""
+    """Read fx, fy, cx, cy from a matrix, also in one line, from four numbers, or from NSVF's f, cx and cy."""
     names = ("intrinsic/intrinsic_color.txt", "intrinsics_color.txt", "intrinsic_color.txt", "intrinsics.txt",
              "intrinsic.txt", "camera-intrinsics.txt", "calibration.txt", "../camera-intrinsics.txt")  # fmt: skip
     path = next((folder / name for name in names if (folder / name).is_file()), None)
     if path is None:
-        fail(
-            f"{folder} has poses, but no file with the camera ({', '.join(names[:4])}). Put one there with the matrix "
-            "fx 0 cx, 0 fy cy, 0 0 1, a row on each line; or compute the poses: `bitymi-data --format photographs`."
-        )
+        advice = "Write its matrix there, a row on each line, or compute poses: `bitymi-data --format photographs`."
+        fail(f"{folder} has poses, but no file with the camera ({', '.join(names[:4])}). {advice}")
     with parsing(path, AGAIN):
         rows = [[float(word) for word in line.split()] for line in read_text(path, MOST_POSE).splitlines()]
         first, *more = filter(None, rows)

@@ -19,11 +19,11 @@ from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
 from bitymi_ns.capture.folder_contents import open_picture, photographs_below
 from bitymi_ns.capture.image_files import eight_bits, in_srgb
 from bitymi_ns.capture.order import natural
-from bitymi_ns.capture.types import CaptureError, is_full_sphere
+from bitymi_ns.capture.types import CaptureError, fail, is_full_sphere
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.safe_reading import open_regular, why
-from bitymi_ns.trust import is_text
+from bitymi_ns.trust import is_text, listed
 
 PLAIN = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "BMP": (".bmp",), "TIFF": (".tif", ".tiff"),
@@ -72,11 +72,9 @@ def find_photos(folder: Path) -> list[str]:
 def check_names(folder: Path, names: Sequence[str]) -> None:
     """Check that names are UTF-8, as COLMAP and JSON need. Raises CaptureError: a name or the folder's path is not."""
     where = os.path.realpath(folder)
-    wrong = [name for name in (where, *names) if not is_text(name)]
-    if wrong:
-        more = f" and of {len(wrong) - 1} more" if len(wrong) > 1 else ""
+    if wrong := [name for name in (where, *names) if not is_text(name)]:
         advice = "rename it (`convmv -r -f latin1 -t utf8 --notest FOLDER` does so for names in an older encoding)"
-        raise CaptureError(f"in {where}, the name of {wrong[0]}{more} is not UTF-8: {advice}")
+        fail(f"in {where}, the name of {listed(wrong, most=1)} is not UTF-8: {advice}")
 
 
 def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[list[Photo], dict[str, str]]:
@@ -113,12 +111,10 @@ def read_photo(folder: Path, name: str) -> Photo:
             if image.format != "JPEG":  # Pillow turns TIFF by itself, and changes its size
                 width, height = grey.size
             frames = getattr(image, "n_frames", 1)
-    except (CaptureError, MemoryError):
+    except MemoryError:
         raise
-    except Image.DecompressionBombError as error:
-        raise CaptureError("it has too many pixels to be a photograph") from error
     except Exception as error:  # decoders raise many kinds on broken files
-        raise CaptureError(f"it cannot be read ({why(error)}): the file is damaged or not an image") from error
+        fail(f"it cannot be read ({why(error)}): the file is damaged, too large or not an image", error)
     if min(width, height) < 32:
         raise CaptureError(f"it is only {width} x {height} pixels")
     plain = orientation in (0, 1) and plain and frames == 1 and mode in ("L", "RGB", "RGBA", "P")
@@ -209,28 +205,24 @@ def upright_photos(
 
 def blurred(photos: Sequence[Photo]) -> list[str]:
     """List photographs with much less fine detail than the median."""
-    if len(photos) < 3:
-        return []
     middle = float(np.median([photo.sharpness for photo in photos]))
     return [photo.name for photo in photos if photo.sharpness < BLURRED * middle]
 
 
 def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
     """Map near-duplicates to the sharper photograph of the same picture, by name; see `shift`."""
-    found: dict[str, str] = {}
-    for shape in {photo.thumb.shape for photo in photos}:
-        same = sorted((p for p in photos if p.thumb.shape == shape), key=lambda p: -p.sharpness)
-        kept: list[tuple[float, Photo]] = []
-        for photo in same:
-            level = float(photo.thumb.mean())
-            # a duplicate has almost the same mean: compare few pixel by pixel
-            near = (other for mean, other in kept if abs(mean - level) < 2.0)
-            twin = next((other for other in near if shift(photo.thumb, other.thumb) < DUPLICATE_SHIFT), None)
-            if twin is not None:
-                found[photo.name] = twin.name
-            else:
-                kept.append((level, photo))
-    return found
+    sharper: dict[str, str] = {}
+    kept: list[tuple[float, Photo]] = []
+    for photo in sorted(photos, key=lambda photo: -photo.sharpness):
+        level, thumb = float(photo.thumb.mean()), photo.thumb
+        # a duplicate has almost the same mean: compare few pixel by pixel
+        near = (twin for mean, twin in kept if abs(mean - level) < 2.0 and twin.thumb.shape == thumb.shape)
+        twin = next((twin for twin in near if shift(thumb, twin.thumb) < DUPLICATE_SHIFT), None)
+        if twin is not None:
+            sharper[photo.name] = twin.name
+        else:
+            kept.append((level, photo))
+    return sharper
 
 
 def shift(first: np.ndarray, second: np.ndarray) -> float:

@@ -57,7 +57,7 @@ class Split(NamedTuple):
 
 
 def split_members(split: Split, groups: Sequence[int]) -> Split:
-    """Extend a split of groups to their members, as of rig frames to photographs, or of photographs to views."""
+    """Extend a split of groups to their members, as of rig frames to photographs."""
     sides = [set(side) for side in (split.train, split.held_out)]
     train, held_out = ([i for i, group in enumerate(groups) if group in side] for side in sides)
     return Split(train, held_out, split.rule)
@@ -68,8 +68,8 @@ def choose_split(photographs: Sequence[Photograph], lists: NameLists, options: S
     except by lists. Raises CaptureError: a name matches no photograph, or several."""
     names = [photograph.file for photograph in photographs]
     first: dict[object, int] = {}
-    frames = [first.setdefault(i if each.frame is None else ("frame", each.frame), i)
-              for i, each in enumerate(photographs)]  # fmt: skip
+    frames = [i if photograph.frame is None else first.setdefault(photograph.frame, i)
+              for i, photograph in enumerate(photographs)]  # fmt: skip
     groups = sorted(set(frames))
     if options.eval_names:
         split = by_names(names, options.eval_names, "--eval-names")
@@ -101,9 +101,8 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
     train = [i for i in indices if "train" in names[i].name]
     held_out = [i for i in indices if "train" not in names[i].name and "eval" in names[i].name]
     if neither := sorted(set(indices) - {*train, *held_out}):
-        which, short = "has neither train nor eval in its name", told_apart(names)
-        advice = "Use `--eval-names`, or another mode."
-        fail(f"--eval-mode filename: {listed([short[i] for i in neither])} {which}. {advice}")
+        which = listed([told_apart(names)[i] for i in neither])
+        fail(f"--eval-mode filename: {which} has neither train nor eval in its name. Use `--eval-names`.")
     return Split(train, held_out, "those with eval in their names")
 
 
@@ -111,7 +110,7 @@ def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split
     """Hold out photographs by name, with leading folders where the name alone matches several. Raises CaptureError: a
     name matches no photograph, or several."""
     held_out = set(find_named(names, wanted, source))
-    return Split([i for i in range(len(names)) if i not in held_out], sorted(held_out), f"by {source}")
+    return Split(sorted(set(range(len(names))) - held_out), sorted(held_out), f"by {source}")
 
 
 def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
@@ -146,9 +145,9 @@ def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLi
     """Read the lists of names of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`; else
     3DGS's `test.txt` in the model's folder, which may name more than the photographs' `files`."""
     stated = [(row.what, folder / name) for row in LISTS for name in row.names.split()]
-    found, test = {split: _names_in(path, path) for split, path in stated if path.is_file()}, model / "test.txt"
-    if found or not test.is_file():
-        return NameLists(found)
+    lists, test = {split: _names_in(path, path) for split, path in stated if path.is_file()}, model / "test.txt"
+    if lists or not test.is_file():
+        return NameLists(lists)
     there, named = {part for file in files for part in (file.name, file.stem)}, _names_in(test, test)
     known = [name for name in named if {Path(name).name, Path(name).stem} & there]
     if len(known) < len(named):
@@ -158,11 +157,11 @@ def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLi
 
 def lists_by_name(files: Sequence[Path], rows: Sequence[Kind], source: str) -> NameLists:
     """List photographs by names of splits; no lists unless rows name all, some for training and some for others."""
-    found: dict[str, list[str]] = {}
+    lists: dict[str, list[str]] = {}
     for file in files:
         row = kind_of(file, rows)
-        found.setdefault("" if row is None else row.what, []).append(str(file))
-    return NameLists({} if "" in found or "train" not in found or len(found) < 2 else found, source)
+        lists.setdefault("" if row is None else row.what, []).append(str(file))
+    return NameLists({} if "" in lists or "train" not in lists or len(lists) < 2 else lists, source)
 
 
 Pair = tuple[int, int]  # index of a training photograph, and of a held-out one
@@ -178,6 +177,6 @@ def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: S
     """Warn of held-out photographs that are trained on, unless all views serve for both."""
     if not pairs or list(train) == list(held_out):
         return
-    named = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
+    which = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
     advice = "Figures on them say nothing about new views: remove the duplicates from the capture."
-    warn(f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {named}. {advice}")
+    warn(f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {which}. {advice}")

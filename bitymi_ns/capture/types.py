@@ -183,8 +183,6 @@ class FoundPoses:
         """Reason to doubt the poses, and what to do; empty = none."""
         if self.contradicted <= CONTRADICTED:
             return ""
-        return (
-            f"{self.contradicted:.0%} of what photographs have in common contradicts their poses: parts of the scene "
-            f"look alike or moved, and photographs may be misplaced. Look at {self.report / 'cameras.png'}; if they "
-            "are, take more photographs, each sharing most with the one before and showing what differs, or panoramas."
-        )
+        why = "parts of the scene look alike or moved, and photographs may be misplaced"
+        advice = f"Look at {self.report / 'cameras.png'}; take more photographs that show what differs, or panoramas."
+        return f"{self.contradicted:.0%} of what photographs have in common contradicts their poses: {why}. {advice}"

@@ -15,7 +15,7 @@ from PIL import Image, ImageOps
 
 from bitymi_ns.capture.cache import content_key, made_once
 from bitymi_ns.capture.sfm_photos import IMAGES, JPEG_QUALITY, sharpness
-from bitymi_ns.capture.types import CaptureError, warn
+from bitymi_ns.capture.types import fail, warn
 from bitymi_ns.files import Tell, complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.safe_reading import open_regular
@@ -50,10 +50,8 @@ def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -
     def extract(work: Path) -> None:
         total = _pace(video)[2]
         if abs(total - poses) > max(2, poses // 100):
-            raise CaptureError(
-                f"{video} has {total} frames, but {poses} poses: which belong together is unknown. Export the capture "
-                f"again, or have poses computed: `bitymi-data --data {video}`"
-            )
+            what = f"{video} has {total} frames, but {poses} poses: which belong together is unknown"
+            fail(f"{what}. Export the capture again, or have poses computed: `bitymi-data --data {video}`")
         extract_frames(video, work, None, progress, upright=False)
 
     return made_once(video.parent, content_key([(video.name, video)], "frames"), "frames", tell, extract) / IMAGES
@@ -68,9 +66,9 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
         return target
     seen, motion, sharp = _survey(video, progress)
     if len(seen) < 3:
-        raise CaptureError(f"{video} has too few frames ({len(seen)}): film for ten seconds, walking round the scene")
+        fail(f"{video} has too few frames ({len(seen)}): film for ten seconds, walking round the scene")
     if motion[-1] < STILL:
-        raise CaptureError(f"{video} {NO_MOTION}")
+        fail(f"{video} {NO_MOTION}")
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
     chosen = choose(np.array(motion), np.array(sharp), wanted)
     numbers = {seen[i] for i in chosen}
@@ -105,8 +103,7 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
     seen: list[int] = []
     motion: list[float] = []
     sharp: list[float] = []
-    before: np.ndarray | None = None
-    last = -math.inf
+    before, last = None, -math.inf
     gap, rate, total = _pace(video)
     for number, frame in _frames(video):
         time = number / rate if frame.time is None else frame.time
@@ -176,10 +173,10 @@ def _opened(video: Path) -> InputContainer:
         container = av.open(os.path.abspath(video), options=TRUSTED)  # a relative path may begin like a URL
     except (av.FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
-        raise CaptureError(f"{video} cannot be read as a video ({reason}): record or export it again") from error
+        fail(f"{video} cannot be read as a video ({reason}): record or export it again", error)
     if not container.streams.video:
         container.close()
-        raise CaptureError(f"{video} holds no pictures, only sound: name another file")
+        fail(f"{video} holds no pictures, only sound: name another file")
     return container
 
 
@@ -197,7 +194,7 @@ def _frames(video: Path) -> Iterator[tuple[int, av.VideoFrame]]:
         again, last, _ = yield from _decoded(video, "SLICE", last)
         line = again or line
     if line and last < 0:
-        raise CaptureError(f"{line} Record or export it again.")
+        fail(f"{line} Record or export it again.")
     if line:
         warn(f"{line} Copy it again if you can.")
 

@@ -24,15 +24,8 @@ PAIRS_TRIED = 60
 TELLING = 30  # fewest matches of a pair that tell a rotation from a translation
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)  # unknown focal lengths, in longer sides
 
-SHOOT = (
-    "Walk round the scene and photograph it from many places, each photograph sharing at least two thirds of what it "
-    "shows with the one before"
-)
-
-FROM_ONE_SPOT = (
-    "the photographs were taken from one spot: the camera only turned, which tells nothing of depth. Step sideways "
-    f"between photographs, as if the scene were on a turntable. {SHOOT}"
-)
+SHOOT = "Walk round it and take photographs of which each shares at least two thirds with the one before"
+FROM_ONE_SPOT = "the photographs were taken from one spot, which tells nothing of depth. Step sideways between them"
 
 
 @dataclass(frozen=True)
@@ -65,13 +58,12 @@ def view_graph(database: Path) -> ViewGraph:
 
 def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[str, str]:
     """Explain by name (`title`) why photographs other than the `placed` ones have no pose."""
-    best: Counter[str] = Counter()
+    best: Counter[str] = Counter()  # most matches with another photograph
     with_placed: Counter[str] = Counter()
     for (first, second), count in graph.inliers.items():
-        for name, other in ((first, second), (second, first)):
+        for name, partner in ((first, second), (second, first)):
             best[name] = max(best[name], count)
-            if other in placed:
-                with_placed[name] = max(with_placed[name], count)
+            with_placed[name] = max(with_placed[name], count * (partner in placed))
     reasons = {}
     for name, count in graph.features.items():
         if name in placed:
@@ -92,10 +84,8 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
     count = len(job.order)
     bare = sum(features < FEW_FEATURES for features in graph.features.values())
     if bare > count / 2:
-        return NoPoses(
-            f"{bare} of {count} photographs show hardly any detail (fewer than {FEW_FEATURES} features): they are "
-            "blurred, dark, or show bare surfaces. Use more light, hold still, and take in surroundings with texture"
-        )
+        why = f"fewer than {FEW_FEATURES} features: they are blurred, dark, or show bare surfaces"
+        return NoPoses(f"{bare} of {count} photographs show hardly any detail ({why}). Take in more, in more light")
     parts = graph.components()
     if not parts or len(parts[0]) < max(3, 0.2 * count):
         together = f"at most {len(parts[0])} of {count} are connected" if parts else "no two of them show the same"
@@ -134,8 +124,8 @@ def only_turned(job: Job, database: Path) -> bool:
         of_pair = zip((first, second), matches.T, strict=True)
         pair_of = [(groups[images[i].name], points[i][column]) for i, column in of_pair]
         limit = ROTATED * max(1.0, max(pair_of[0][0].camera.size) / job.max_image_size)
-        for guess in GUESSES[: 1 if all(each.prior for each, _ in pair_of) else None]:
-            (a, focal), (b, _) = (_rays(*each, guess) for each in pair_of)
+        for guess in GUESSES[: 1 if all(group.prior for group, _ in pair_of) else None]:
+            (a, focal), (b, _) = (_rays(group, pixels, guess) for group, pixels in pair_of)
             if np.mean(_turn_errors(a, b, focal) < limit) > MOST:
                 turned += 1
                 break

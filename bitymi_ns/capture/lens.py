@@ -215,7 +215,8 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
                 messages.append(f"{photograph.label} is {camera.model}: {become}")
         lenses.append(made[key])
     if messages:
-        say(f"{listed(messages)}.")
+        shown = listed(messages)
+        say(f"{shown[0].upper()}{shown[1:]}.")
     return lenses
 
 

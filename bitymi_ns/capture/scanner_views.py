@@ -49,7 +49,7 @@ def scanner_photographs(found: Found) -> list[Photograph]:
     for row in rows:
         sides = row.size or ()
         if not np.isfinite([*row.pose.ravel(), *row.pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in sides):
-            fail(f"{what} is damaged: the pose, camera or size of {row.file.name} is no finite number. {AGAIN}")
+            fail(f"{what} is damaged: the pose, camera or size of {row.file.name} is not finite, or 0. {AGAIN}")
     if len(rows) < 2:
         fail(f"{what} has {len(rows)} photographs with poses: a scene needs many.")
     files = [row.file for row in rows]

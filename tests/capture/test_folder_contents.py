@@ -83,7 +83,7 @@ def test_files_of_these_names_that_are_something_else(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("mark", "text", "message"), [
     ("bundle.json", MANIFEST, "is a bundle, not a capture: give the folder of its photographs. `bitymi view"),
-    ("config.yml", CONFIG, "is a training run, not a capture: give the folder of its photographs, and --load-dir"),
+    ("config.yml", CONFIG, "is a training run, not a capture: give the folder of its photographs; --load-dir"),
 ])  # fmt: skip
 def test_a_result_is_no_capture(tmp_path: Path, mark: str, text: str, message: str) -> None:
     for name in "abcd":

@@ -134,7 +134,7 @@ def test_those_of_less_than_all_directions_are_refused(tmp_path: Path, monkeypat
     for i in range(4):
         Image.fromarray(panorama(0.3 * i, 64)[:, : 128 - 40]).save(tmp_path / f"walk/{i}.png")
     with pytest.raises(
-        CaptureError, match="4 of 4 photographs .* are panoramas .* all directions, twice as wide as high"
+        CaptureError, match="4 of 4 photographs .* are panoramas .* show all directions, twice as wide as high"
     ):
         find_poses(tmp_path / "walk", SfmOptions(camera_model="EQUIRECTANGULAR"))
 

@@ -163,7 +163,7 @@ def test_the_report_says_what_was_found_and_what_was_left_out(capture: Path, mon
     assert json.loads((poses.report / "frame.json").read_text("utf8"))["metres_per_unit"] is None
     left_out = poses.left_out
     assert len(left_out) == 3 and left_out.keys() & {"wieder.png", "Bild photo_3.png"}
-    assert "damaged or not an image" in left_out["kaputt.jpg"]
+    assert "damaged, too large or not an image" in left_out["kaputt.jpg"]
     assert "no other photograph shows the same" in left_out["woanders.png"]
     assert any(why.startswith("the same as") for why in left_out.values())
 
@@ -215,7 +215,7 @@ def test_photographs_that_give_no_poses(arc: Path, tmp_path: Path) -> None:
     for i, (pictures, message) in enumerate(
         [
             ([], "holds no photographs: camera poses need at least 3"),
-            ([one], "holds one photograph: camera poses need at least 3"),
+            ([one], "holds 1 photographs: camera poses need at least 3"),
             ([one, two], "holds 2 photographs: camera poses need at least 3"),
             ([None, None, None, one], r"only 1 can be used \(0.png: it cannot be read"),
             ([one] * 4, "only 1 differ"),

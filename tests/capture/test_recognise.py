@@ -167,7 +167,7 @@ def test_a_format_that_is_not_there(tmp_path: Path) -> None:
         recognise(tmp_path, "blender")
     with pytest.raises(CaptureError, match="--colmap-path is for COLMAP models"):
         recognise(tmp_path, "blender", Path("sparse/0"))
-    with pytest.raises(CaptureError, match="sparse/0 does not exist, and there is none"):
+    with pytest.raises(CaptureError, match="sparse/0 does not exist. There is none"):
         recognise(tmp_path, colmap_path=Path("sparse/0"))
     model(tmp_path / "sparse/1")
     with pytest.raises(CaptureError, match="does not exist. Give `--colmap-path sparse/1`"):

@@ -63,7 +63,7 @@ def test_a_damaged_file_among_good_ones_is_named(tmp_path: Path, pictures: list[
     (tmp_path / "2.jpg").write_bytes(b"")
     photos, broken = read_photos(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], silent)
     assert [photo.name for photo in photos] == ["0.jpg"]
-    assert "truncated" in broken["1.jpg"] and "damaged or not an image" in broken["2.jpg"]
+    assert "truncated" in broken["1.jpg"] and "damaged, too large or not an image" in broken["2.jpg"]
     Image.new("RGB", (16, 16)).save(tmp_path / "a.png")  # an icon
     with pytest.raises(CaptureError, match="16 x 16"):
         read_photo(tmp_path, "a.png")

@@ -30,10 +30,8 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     if int(kind) != CameraType.PERSPECTIVE.value:
         fail(f"cameras of type {CameraType(int(kind)).name.lower()} cannot be rendered; only perspective cameras can")
     if bool((row[19:] != 0).any()):
-        fail(
-            "a camera has lens distortion, which this method does not render. Training and evaluation undistort the "
-            "photographs on loading; for other tools undistort the capture first (COLMAP's image_undistorter)."
-        )
+        why = "a camera has lens distortion, which this method does not render"
+        fail(f"{why}. For tools that do not undistort, undistort the capture first (COLMAP's image_undistorter).")
     c2w = row[7:19].view(3, 4)
     rotation = c2w[:, :3] * c2w.new_tensor([1.0, -1.0, -1.0])
     viewmat = torch.eye(4, dtype=torch.float64)
@@ -71,14 +69,12 @@ def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
             if not unusual:
                 continue
             i = unusual[0]
-            message = (
-                f"focal length of {listed([names[j] for j in unusual])} is {focal[i]:g} pixels ({key}): "
-                f"{int(size[i])} pixels of the picture span {degrees[i]:.3g} degrees. Focal lengths are in "
-                "pixels, not in millimetres, and camera_angle_x is in radians."
-            )
+            what = f"focal length of {listed([names[j] for j in unusual])} is {focal[i]:g} pixels ({key})"
+            span = f"{int(size[i])} pixels of the picture span {degrees[i]:.3g} degrees"
+            unit = "It is in pixels, not in millimetres, and camera_angle_x is in radians"
             if refused:
-                fail(f"the {message} Correct the capture.")
-            warn(f"The {message} If that is a mistake, correct the capture.")
+                fail(f"the {what}: {span}. {unit}. Correct the capture.")
+            warn(f"The {what}: {span}. {unit}. If that is a mistake, correct the capture.")
             return
 
 

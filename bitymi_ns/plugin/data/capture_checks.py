@@ -105,11 +105,8 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        fail(
-            f"nerfstudio's reader of this capture cannot be loaded: {error}. If that names a library (lib....so), "
-            "install the system's package of it; if a module, install it with pip.",
-            error,
-        )
+        what = f"nerfstudio's reader of this capture cannot be loaded: {error}"
+        fail(f"{what}. Install the module with pip, or the library (lib....so) with the system's packages.", error)
     except Image.DecompressionBombError as error:  # nerfstudio opens photographs before they are checked
         fail(f"{capture} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller", error)
     except (CaptureError, NameError, AssertionError):  # clear already, or no fault of the capture

@@ -125,10 +125,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
     def sample_train_cameras(self) -> list[int]:
         """Return the training views for nerfstudio's base class; `train_index` orders them."""
         if len(self.train_dataset) == 0:
-            fail(
-                f"no image is left for training in {self.config.data}: all {len(self.eval_dataset)} are held out for "
-                "evaluation. Take more photographs, or train on all of them with `bitymi-data --eval-mode all`."
-            )
+            which = f"no image is left for training in {self.config.data}: all {len(self.eval_dataset)} are held out"
+            fail(f"{which}. Take more photographs, or train on all of them with `bitymi-data --eval-mode all`.")
         return list(range(len(self.train_dataset)))
 
     def _check_images(self, test_mode: str) -> None:
@@ -138,21 +136,15 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         count, datasets = len(self.train_dataset), (self.train_dataset, self.eval_dataset)
         train, held_out = (dataset.image_filenames for dataset in datasets)
         names = [*train, *held_out]
-        files = [dataset.facts.files for dataset in datasets]
         check_cameras([dataset.cameras for dataset in datasets], names)
         poses = torch.cat([dataset.cameras.camera_to_worlds for dataset in datasets]).double().numpy()
         warn_of_mirrored(poses[:, :, :3], names)
         check_outliers(poses[:, :, 3], names)
-        every = list(dict.fromkeys([*files[0], *files[1]]))
-        check_photographs_exist(self.get_datapath(), every)
+        check_photographs_exist(self.get_datapath(), [file for dataset in datasets for file in dataset.facts.files])
         if count == 1 and test_mode == "val":
-            one = f"only one training view in {self.config.data}"
-            fail(f"{one}. A scene cannot be learned from one image: take photographs from more sides.")
+            fail(f"only one training view in {self.config.data}: take photographs from more sides.")
         if count < FEW_VIEWS and test_mode == "val":
-            warn(
-                f"Only {count} training views: all of them are used for multi-view scoring, and views "
-                "from elsewhere will look poor. Twenty or more photographs are advisable."
-            )
+            warn(f"Only {count} training views: views from elsewhere will look poor. Take twenty or more photographs.")
 
     def _check_points(self) -> None:
         """Warn if points have no colors, or another unit than the poses."""
@@ -188,15 +180,15 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         train, held_out = self.train_dataset, self.eval_dataset
         empty: dict[str, list[Path]] = {}
         for i, path in enumerate(train.image_filenames):
-            if train.summary(i).empty:
-                empty.setdefault(train.summary(i).empty, []).append(path)
+            if reason := train.summary(i).empty:
+                empty.setdefault(reason, []).append(path)
         if sum(map(len, empty.values())) == len(train):
             what = "; ".join(f"{reason}: {listed(paths)}" for reason, paths in empty.items())
             fail(f"there is nothing to learn from the {len(train)} training photographs: {what}.")
         for reason, paths in empty.items():
             warn(f"Of {len(train)} training photographs {len(paths)} show nothing, {reason}: {listed(paths)}.")
-        summaries = [[d.summary(i) for i in range(len(d))] for d in (train, held_out)]
-        fingerprints = [[None if each.empty else each.fingerprint for each in some] for some in summaries]
+        summaries = [[dataset.summary(i) for i in range(len(dataset))] for dataset in (train, held_out)]
+        fingerprints = [[None if image.empty else image.fingerprint for image in images] for images in summaries]
         splits.warn_of_duplicates(splits.duplicates(*fingerprints), train.image_filenames, held_out.image_filenames)
 
     @cached_property
@@ -258,16 +250,16 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return lambda camera: carried(camera, given, motions)
 
     def corrections(self, state: Mapping[str, Any] | None) -> list[list[Tensor | None]]:
-        """Return the colour corrections of the training and of the held-out views (`Exposure.at`), by the state of a
+        """Return the color corrections of the training and of the held-out views (`Exposure.at`), by the state of a
         run's `Exposure`."""
         train, held_out = self.train_dataset.facts.files, self.eval_dataset.facts.files
         exposure = restored(state, len(train), train)
         return [[exposure.at(file) for file in files] for files in (train, held_out)]
 
     def corrected_eval_views(self, state: Mapping[str, Any] | None) -> OnDemand[View]:
-        """Return the held-out views with their colour corrections, by the state of a run's `Exposure`."""
-        views, (_, found) = self.eval_views, self.corrections(state)
-        return OnDemand(len(views), lambda i: views[i]._replace(correction=found[i]))
+        """Return the held-out views with their color corrections, by the state of a run's `Exposure`."""
+        views, (_, held_out) = self.eval_views, self.corrections(state)
+        return OnDemand(len(views), lambda i: views[i]._replace(correction=held_out[i]))
 
     def _views(self, dataset: BitymiDataset, batch: Callable[[int], dict[str, Any]]) -> OnDemand[View]:
         cameras: dict[int, Camera] = {}  # converting one of nerfstudio's takes 1 % of a training step

@@ -161,12 +161,11 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
     blank = [i for i, box in enumerate(boxes) if box is None]
     if not blank:
         return outputs
+    which = f"of {len(masks)} {split} photographs exclude every pixel"
     named = listed([outputs.image_filenames[i] for i in blank])
     if split == "training" and len(blank) == len(masks):
-        advice = "Pixels count where the mask is not black; if the masks are inverted, invert them."
-        fail(f"the masks of all {len(masks)} {split} photographs exclude every pixel: {named}. {advice}")
-    blank_of = f"{len(blank)} of {len(masks)} {split} photographs"
-    warn(f"The masks of {blank_of} exclude every pixel: {named}. These views are left out.")
+        fail(f"the masks {which}: {named}. Pixels count where the mask is not black: invert inverted masks.")
+    warn(f"The masks of {len(blank)} {which}: {named}. These views are left out.")
     return select_views(outputs, [i for i in range(len(masks)) if i not in blank])
 
 
@@ -191,7 +190,5 @@ def warn_of_other_capture(before: Mapping[str, Any] | None, now: Mapping[str, An
         what = "its cameras stand elsewhere"
     else:
         return
-    warn(
-        f"The run was trained on another capture: {what}. Photographs that are held out now may have been trained on, "
-        "and what was learned of another scene stays visible. Where that matters, train a new run."
-    )
+    then = "Photographs that are held out now may have been trained on. Where that matters, train a new run."
+    warn(f"The run was trained on another capture: {what}. {then}")

@@ -85,16 +85,12 @@ def with_depth(
 
 def _read_maps(outputs: DataparserOutputs, facts: CaptureFacts, rows: Sequence[int], unit: float | None) -> list[_Seen]:
     lenses, maps = facts.lenses, facts.maps
-    small = {
-        lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
-        for lens in dict.fromkeys(lenses[i] for i in rows)
-    }
+    small = {lens: lens.downscaled(min(1.0, SIDE / max(lens.pinhole.width, lens.pinhole.height)))
+             for lens in dict.fromkeys(lenses[i] for i in rows)}  # fmt: skip
     values = in_threads(lambda i: read_depth(maps[i], small[lenses[i]], unit), rows)
     poses = outputs.cameras.camera_to_worlds.double().numpy()
-    return [
-        _Seen(each, small[lenses[i]], poses[i, :, 3], poses[i, :, :3] * (1.0, -1.0, -1.0))
-        for i, each in zip(rows, values, strict=True)
-    ]
+    return [_Seen(depth, small[lenses[i]], poses[i, :, 3], poses[i, :, :3] * (1.0, -1.0, -1.0))
+            for i, depth in zip(rows, values, strict=True)]  # fmt: skip
 
 
 def _check_normals(facts: CaptureFacts) -> None:
@@ -105,10 +101,9 @@ def _check_normals(facts: CaptureFacts) -> None:
         away = (normal * lens.pinhole.rays).sum(-1) > 0.0
         known = normal.any(-1)
         if known.any() and away[known].mean() > 0.2:
-            warn(
-                f"{away[known].mean():.0%} of the normals of {files.normal} face away from the camera: they are not "
-                "in its frame (x right, y up, z back). Correct them, or train without: `bitymi-data --depth off`."
-            )
+            what = f"{away[known].mean():.0%} of the normals of {files.normal} face away from the camera"
+            frame = "they are not in its frame (x right, y up, z back)"
+            warn(f"{what}: {frame}. Correct them, or train without: `bitymi-data --depth off`.")
             return
 
 
@@ -145,10 +140,8 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> S
         fit = DepthFit(unit)
         agreement = _agreement([each.fitted(fit) for each in seen])
         if agreement is not None and agreement < AGREE_MUTUALLY:
-            warn(
-                f"The depth maps agree with each other in {agreement:.0%} of their pixels by the poses, so depth is "
-                "not used: its unit may be another (`bitymi-data --depth-unit-scale-factor`)."
-            )
+            what = f"The depth maps agree with each other in {agreement:.0%} of their pixels by the poses"
+            warn(f"{what}: depth is not used. Its unit may be another (`bitymi-data --depth-unit-scale-factor`).")
             return None
         say(f"Depth of {len(seen)} photographs is used as metric.")
         return [fit] * len(seen)
@@ -158,22 +151,20 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> S
     share = 0.0
     if kind != "metric":
         for inverse in (False, True):
-            found = [_affine(*pair, inverse) for pair in pairs]
-            mean = sum(s * len(pair[0]) for (_, s), pair in zip(found, pairs, strict=True)) / len(z)
+            fits = [_affine(*pair, inverse) for pair in pairs]
+            mean = sum(agree * len(pair[0]) for (_, agree), pair in zip(fits, pairs, strict=True)) / len(z)
             if mean > share:
-                relative, share = [fit for fit, _ in found], mean
+                relative, share = [fit for fit, _ in fits], mean
     use_relative = kind == "relative" or (kind == "auto" and share > metric + BETTER)
     if (share if use_relative else metric) < AGREES:
-        what = "with scale and shift fitted to each" if use_relative else "with one scale for all"
-        then = "depth is not used. They may be of other photographs, or not of camera z."
-        warn(f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {what}: {then}")
+        how = "with scale and shift fitted to each" if use_relative else "with one scale for all"
+        what = f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {how}"
+        warn(f"{what}: depth is not used. They may be of other photographs, or not of camera z.")
         return None
     if use_relative:
-        inverse = any(fit is not None and fit.inverse for fit in relative)
-        say(
-            f"Depth of {sum(fit is not None for fit in relative)} of {len(seen)} photographs is relative"
-            f"{' and inverse' if inverse else ''}: scale and shift are fitted to the points."
-        )
+        usable = [fit for fit in relative if fit is not None]
+        kind = "relative and inverse" if any(fit.inverse for fit in usable) else "relative"
+        say(f"Depth of {len(usable)} of {len(seen)} photographs is {kind}: scale and shift are fitted to the points.")
         return relative
     ratio = scale / unit
     other = "" if abs(ratio - 1.0) < 2 * TOLERANCE else f", times {ratio:.4g} by the points"
@@ -243,8 +234,8 @@ def _agreement(seen: Sequence[_Seen]) -> float | None:
 def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64]:
     """Count other fitted views that agree with, see through and occlude points [N, 3]: [3, N]."""
     votes = np.zeros((3, len(xyz)), np.int64)
-    others = [j for j in range(len(seen)) if j != own]
-    for j in (others[k] for k in spread(len(others), SEEN_BY)):
+    views = [j for j in range(len(seen)) if j != own]
+    for j in (views[k] for k in spread(len(views), SEEN_BY)):
         pixels, z, inside = _project(xyz, seen[j])
         depth = seen[j].values.ravel()[pixels]
         known = inside & (depth > 0.0)
@@ -271,9 +262,7 @@ def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tup
         image = lens.undistort(read_image(files[i], lens.stored, lens.camera.size).convert("RGB"))
         return xyz[kept], np.asarray(image).reshape(-1, 3)[draws[i][kept]], 1.0 / (1.0 + agree[kept])
 
-    parts = in_threads(of_view, range(len(seen)))
-    xyz, rgb = np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])
-    weight = np.concatenate([part[2] for part in parts])
+    xyz, rgb, weight = map(np.concatenate, zip(*in_threads(of_view, range(len(seen))), strict=True))
     if len(xyz) <= count:
         return xyz, rgb
     order = np.sort(np.argsort(rng.exponential(size=len(xyz)) / weight, kind="stable")[:count])

@@ -45,8 +45,8 @@ class FittedMaps(NamedTuple):
 
     def read(self, lens: Lens) -> dict[str, Values]:
         """Read depth [H, W] and normal [H, W, 3] if they are used, see `View`."""
-        found = {} if self.fit is None else {"depth": self.fit.z(read_depth(self.files, lens, self.unit))}
-        return found if self.files.normal is None else {**found, "normal": read_normal(self.files, lens)}
+        depth = {} if self.fit is None else {"depth": self.fit.z(read_depth(self.files, lens, self.unit))}
+        return depth if self.files.normal is None else {**depth, "normal": read_normal(self.files, lens)}
 
 
 @dataclass(frozen=True)

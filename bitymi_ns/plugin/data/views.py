@@ -52,15 +52,13 @@ def make_views(
     of, names, cameras, facts = _split(parts, moved, [photograph.file for photograph in photographs])
     lenses = facts.lenses
     maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(of, lenses, strict=True)]
-    wide = [photographs[i].file for i, lens in zip(of, lenses, strict=True) if lens.face and photographs[i].maps.depth]
+    wide = {photographs[i].file for i, lens in zip(of, lenses, strict=True) if lens.face and photographs[i].maps.depth}
     if wide:
-        say(f"Depth of photographs that become faces of a cube is not used: {listed(list(dict.fromkeys(wide)))}.")
+        say(f"Depth of photographs that become faces of a cube is not used: {listed(sorted(wide))}.")
     facts = dataclasses.replace(
         facts,
-        maps=maps if any(each != MapFiles() for each in maps) else (),
-        declares_box=capture.declares_box,
-        poses_report=capture.report,
-        poses_found=capture.model,
+        maps=maps if set(maps) != {MapFiles()} else (),
+        **{"declares_box": capture.declares_box, "poses_report": capture.report, "poses_found": capture.model},
     )
     metadata: dict[str, Any] = {KEY: facts}
     if points is not None and len(points.xyz):
@@ -113,10 +111,8 @@ def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose,
     transform[:, :3] = u @ v
     far = frame.center_method == "none" and far_from_origin(poses[:, :3, 3])
     if far:
-        say(
-            f"The cameras of {source} lie {np.linalg.norm(middle):,.0f} units from the origin, where float32 would "
-            "blur the scene: their middle becomes the origin. Bundles state where that is."
-        )
+        where = f"The cameras of {source} lie {np.linalg.norm(middle):,.0f} units from the origin"
+        say(f"{where}, where float32 would blur the scene: their middle becomes the origin.")
     if far or frame.center_method != "none":
         transform[:, 3] -= transform[:, :3] @ middle
     scale = frame.scale_factor
@@ -133,11 +129,7 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
     columns: dict[str, Any] = {name: column(name) for name in ("fx", "fy", "cx", "cy")}
     columns |= {name: column(name, torch.int32) for name in ("width", "height")}
-    return Cameras(
-        **columns,
-        camera_to_worlds=poses[:, :3, :4],
-        camera_type=CameraType.PERSPECTIVE,
-    )
+    return Cameras(**columns, camera_to_worlds=poses[:, :3, :4], camera_type=CameraType.PERSPECTIVE)
 
 
 def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
@@ -146,10 +138,8 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         return outputs
     cameras = outputs.cameras
     if cameras.camera_to_worlds.ndim != 3:  # nerfstudio's Cameras lose the dimension of a single view
-        fail(
-            "nerfstudio's reader of this format fails on a split with a single photograph. Hold out more of them, for "
-            "example with `--eval-mode interval --eval-interval 4` after the name of the reader."
-        )
+        what = "nerfstudio's reader of this format fails on a split with a single photograph"
+        fail(f"{what}. Hold out more of them: `--eval-mode interval --eval-interval 4` after the reader's name.")
     distortion = cameras.distortion_params
     photographs = []
     for i, file in enumerate(outputs.image_filenames):
@@ -169,8 +159,7 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     """Downscale views of more than `longest` pixels along a side (0 = no limit), in their lenses. Raises InputError:
     `longest` is negative."""
     if longest < 0:
-        how = "give a number of pixels, or 0 to use photographs as they are"
-        fail(f"--pipeline.datamanager.longest-side is {longest}: {how}.")
+        fail(f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 for no limit.")
     facts = CaptureFacts.of(outputs.metadata)
     lenses = facts.lenses
     sizes = [(lens.pinhole.width, lens.pinhole.height) for lens in lenses]
@@ -182,10 +171,9 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     lenses = [small[lens] for lens in lenses]
     if verbose:
         width, height = max(large, key=max)
-        say(
-            f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side (up to "
-            f"{width} x {height}): they are reduced. --pipeline.datamanager.longest-side 0 uses them as they are."
-        )
+        which = f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side"
+        how = "--pipeline.datamanager.longest-side 0 uses them as they are"
+        say(f"{which} (up to {width} x {height}): they are reduced. {how}.")
     cameras = pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds)
     metadata = {**outputs.metadata, KEY: dataclasses.replace(facts, lenses=lenses)}
     return dataclasses.replace(outputs, cameras=cameras, metadata=metadata)

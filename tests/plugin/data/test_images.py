@@ -65,7 +65,7 @@ def test_deep_colour_is_scaled(picture: np.ndarray, tmp_path: Path) -> None:
 def test_floats_beyond_white_are_refused(tmp_path: Path) -> None:
     for values, message in (([[0.0, 900.0]], "lie between 0 and 900"), ([[0.0, np.nan]], "lie between nan and nan")):
         Image.fromarray(np.float32(values)).save(tmp_path / "a.tiff")
-        with refused(f"a.tiff cannot be read: its values {message}.*save it with 8 or 16 bits"):
+        with refused(f"a.tiff cannot be read: its values {message}"):
             read_image(tmp_path / "a.tiff")
 
 

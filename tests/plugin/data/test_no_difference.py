@@ -124,7 +124,7 @@ SAME: list[tuple[Callable[[Path], Path], str, Change, str]] = [
     (blender, "", scaled(2.5), "scaled by 2.5"),
     (blender, "", two_endings, ""),
     (nerfstudio, "", scaled(2.5), "scaled by 2.5 in the poses of images/frame_00001.png, "),
-    (nerfstudio, "", pose(lambda part: 2.5 * part), "in the poses of images/frame_00004.png. The factor is divided"),
+    (nerfstudio, "", pose(lambda part: 2.5 * part), "in the poses of images/frame_00004.png. It is divided out"),
     *((colmap, f"../../{name}", SPOILT[kind], "") for kind in SPOILT
       for name in ("a.json", "metadata.json", "agisoft.xml")),
     *((colmap, "../../train_list.txt", SPOILT[kind], "") for kind in ("pipe", "folder", "dangling")),
@@ -160,7 +160,7 @@ def test_what_makes_no_difference(
     assert said in shown and (said == OTHER_NAMES or "other names" not in shown)
 
 
-UNIT = "The point cloud seems to be in another unit than the poses: half of its points lie"
+UNIT = "The point cloud seems to be in another unit than the poses: half of the points lie"
 SAID: list[tuple[Callable[[Path], Path], str, Change, str]] = [
     *((form, "", entry(lambda meta: (meta.update(fisheye_crop_radius=12.0), meta["frames"][2].update(rotation=0.1))),
        "that are not used: fisheye_crop_radius.") for form in JSON),

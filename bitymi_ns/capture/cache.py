@@ -34,9 +34,8 @@ def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
 
 @contextmanager
 def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -> Iterator[Path]:
-    """Make and lock the folder of this key: in `.bitymi` beside the photographs (or video), or in the user's cache
-    folder if that cannot be written or, as `tell` reports, others can write there. Raises CaptureError: another process
-    works there, or neither can be written."""
+    """Make and lock the folder of this key in `.bitymi` beside the photographs (or video), else in the user's cache
+    folder. Raises CaptureError: another process works there, or neither can be written."""
     beside, cache = home(photographs), user_cache()
     problem: OSError | None = None
     for root in filter(None, (beside, cache)):
@@ -63,8 +62,7 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
 
 
 def home(photographs: Path) -> Path:
-    """Return the cache folder beside photographs or a video, the same for a capture and its folder `images`, but not
-    beside a mount point, where it would not stay with them."""
+    """Return the cache folder beside photographs, or beside their folder `images` unless that is a mount point."""
     folder = Path(os.path.abspath(photographs if photographs.is_dir() else photographs.parent))
     return (folder.parent if folder.name == "images" and not os.path.ismount(folder) else folder) / FOLDER
 

@@ -1,7 +1,6 @@
 """COLMAP models on disk: cameras, poses and points in COLMAP's frame, checked by file and entry.
 
-pycolmap's reader accepts truncated files, ends names in text files at the first space, and reads no model without
-points. So files are parsed here; pycolmap has the camera models (`capture/lens.py`).
+pycolmap's reader accepts truncated files, ends names in text at the first space, and reads no model without points.
 """
 
 import errno
@@ -50,8 +49,7 @@ class Model(NamedTuple):
 
 
 def read_model(folder: Path) -> Model:
-    """Read a model; of both forms the text, as nerfstudio does, with a warning if they differ. Raises CaptureError: it
-    cannot be used; names file and entry."""
+    """Read a model; of both forms the text, with a warning if they differ. Raises CaptureError: it cannot be used."""
     path = _file(folder, "cameras")
     cameras = dict(_parsed(path))
     _check_cameras(path, cameras)
@@ -95,8 +93,7 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
 
 
 def _file(folder: Path, name: str) -> Path:
-    """Choose the text or the binary file of a model: of the form with both cameras and images, because a lone file of
-    the other form is from another export."""
+    """Choose the text or binary file of a model, of the form with cameras and images; a lone file is another's."""
 
     def is_complete(form: str) -> bool:
         return all((folder / f"{each}{form}").is_file() for each in ("cameras", "images"))

@@ -76,9 +76,8 @@ def find_source(found: Found, images: Path | None, downscale: int, need_photos: 
 def _find_folder(
     names: Sequence[str], folder: Path, capture: Path, stated: Path | None, downscale: int, need_photos: bool
 ) -> Path:
-    """Find the folder that has most of a model's photographs: `stated`, else one in `capture`. If `capture` is the
-    model's `folder`, those up to three levels above it are searched, too. Raises CaptureError: photographs are needed,
-    and `stated` is missing or no folder has any."""
+    """Find the folder with most of a model's photographs: `stated`, else in `capture`; if that is the model's, also
+    three levels above it. Raises CaptureError: photographs are needed, and `stated` is missing or no folder has any."""
     if stated is not None:
         if not need_photos or (capture / stated).is_dir() or (capture / f"{stated}_{downscale}").is_dir():
             return capture / stated

@@ -80,9 +80,8 @@ def _channels_differ(values: npt.NDArray[Any]) -> bool:
 
 def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values:
     """Read camera z [H, W] for the pinhole picture of a lens, by nearest neighbors; 0 = unknown. Integers are
-    millimetres, 0 and the largest one unknown. Floating-point numbers are metres; unknown unless finite, above 0 and
-    below 65,504. A confidence of 0 means unknown. `unit` overrides the metres per unit. Raises CaptureError: a file
-    cannot be read, or has another shape than the photograph."""
+    millimetres, floating-point numbers metres, unless `unit` gives metres; 0, the largest integer, numbers from 65,504
+    and a confidence of 0 mean unknown. Raises CaptureError: a file cannot be read, or has another shape."""
     assert files.depth is not None
     stored = _read(files.depth, lens.stored)
     if stored.ndim != 2:
@@ -116,8 +115,7 @@ _WITHOUT = "Write it again, or train without: `bitymi-data --depth off`."
 
 
 def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.NDArray[Any]:
-    """Read an array [H, W] or [H, W, C] of RGB order, after checking its header against the photograph's width and
-    height, and against its shape if `alike`."""
+    """Read an array [H, W] or [H, W, C] of RGB order; check its size, if `alike` also its shape, before."""
 
     def check(shape: tuple[int, ...]) -> None:
         if len(shape) not in (2, 3) or min(shape) < 1:
@@ -184,8 +182,7 @@ def _check_exr_header(file: IO[bytes]) -> None:
 
 
 def read_array(path: Path, check: Check) -> npt.NDArray[Any]:
-    """Read a .npy file, or the first array of a .npz file, if `check` passes. Raises OSError, ValueError: it cannot be
-    read, is no array of numbers, or is cut off."""
+    """Read a .npy file, or the first array of a .npz file, if `check` passes. Raises OSError, ValueError."""
     with open_regular(path) as file:
         if path.suffix.lower() != ".npz":
             return _array(file, check)

@@ -36,9 +36,8 @@ def without_extension(parts: Parts) -> Parts:
 
 @dataclass
 class FileFinder:
-    """Finder of files below a folder by names that machines and programs may have changed, if only one file fits. Names
-    are compared exactly first; then with other separators, case, Unicode form or leading folders, as of absolute names;
-    then with another extension, or none."""
+    """Finder of files below a folder by names that machines and programs may have changed: the exact one first, then
+    the only one with other separators, case, Unicode form or leading folders, then with another extension or none."""
 
     folder: Path  # to which names are relative
     outside: bool = False  # allow names that lead out of it
@@ -244,8 +243,7 @@ def find_named(names: Sequence[Path], wanted: Sequence[str], source: str, any_fo
 
 
 def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> list[Photograph]:
-    """Replace photographs by downscaled copies, if there are any, in `images_2` beside `images`; their names may lack
-    folders, as nerfstudio's tool writes them."""
+    """Replace photographs by copies in `images_2` beside `images`, if there are any; these may lack subfolders."""
 
     def copies(file: Path) -> list[Path]:
         inside = file.relative_to(folder).parts if file.is_relative_to(folder) else (file.parent.name, file.name)

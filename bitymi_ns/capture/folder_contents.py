@@ -51,8 +51,7 @@ def _pattern(names: str) -> re.Pattern[str]:
 
 
 def kind_of(path: Path, rows: Iterable[Kind], beside: Collection[str] = ()) -> Kind | None:
-    """Find the row of a file or folder, by its name with or without ending, the lower-case names `beside` it and its
-    content; None = the table does not know it."""
+    """Find the row of a file or folder by its name, the lower-case names `beside` it and content; None = unknown."""
     for row in rows:
         for form in (path.name.lower(), path.stem.lower()):
             if match := _pattern(row.names).match(form):
@@ -70,8 +69,7 @@ def is_picture(path: Path) -> bool:
 
 
 def look_in(folder: Path, among: Collection[Path] | None = None) -> Iterator[tuple[Path, Kind | None]]:
-    """Walk a folder: yield photographs with None, and other pictures, films and folders that are not searched with
-    their kinds. `among`: search below these folders only."""
+    """Walk a folder, or `among` its folders: yield photographs with None, what is not searched or read with kinds."""
     for parent, below, names in os.walk(folder):
         where, left = Path(parent), _left_out(Path(parent), below)
         yield from ((where / name, kind) for name, kind in left.items() if kind is not HIDDEN)
@@ -80,8 +78,7 @@ def look_in(folder: Path, among: Collection[Path] | None = None) -> Iterator[tup
 
 
 def _files(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, Kind | None]]:
-    """Yield the pictures, films and unread images of a folder with their kinds; raw data beside a photograph of the
-    same name, and films that can be read, are left out."""
+    """Yield pictures, unread films and images of a folder with their kinds, but no raw data beside its photograph."""
     paths = [folder / name for name in sorted(names) if not name.startswith(".")]
     pictures = [path for path in paths if is_picture(path)]
     stems = {path.stem.lower() for path in pictures}
@@ -97,8 +94,7 @@ def _files(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, Kind | No
 
 
 def _left_out(parent: Path, below: Collection[str]) -> dict[str, Kind]:
-    """Map the names of subfolders that are not searched to what they hold. Captures in subfolders beside photographs
-    are left out, because they hold copies of these."""
+    """Map subfolders that are not searched to their kinds; captures beside photographs hold copies of these."""
     names, left, captures = {name.lower() for name in below}, {}, []
     for path in sorted(parent / name for name in below):
         kind = HIDDEN if path.name.startswith(".") else kind_of(path, kinds.FOLDERS, names) or result_in(path)

@@ -152,8 +152,7 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
 
 
 def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray | None) -> pycolmap.Sim3d:
-    """Make the similarity that turns `up` (None = the cameras' mean) to z, moves the cameras' mean position to the
-    origin, and scales their mean distance from it to 1."""
+    """Make the similarity that turns `up`, None = the cameras' mean, to z, and centers and scales the cameras."""
     turns = np.array([image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose])
     side, down, _ = turns.mean(0)
     axis = up

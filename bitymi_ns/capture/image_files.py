@@ -33,8 +33,7 @@ EMPTY: dict[str, Callable[[npt.NDArray[np.uint8]], bool]] = {
 
 
 def set_up_pillow() -> None:
-    """Raise Pillow's limit from 179 million pixels to MAX_PIXELS, and disable Ghostscript, which PostScript files of
-    any name would start, in nerfstudio's readers too."""
+    """Raise Pillow's limit to MAX_PIXELS, and disable Ghostscript, which files of any name would start."""
     EpsImagePlugin.gs_binary = False
     Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
 
@@ -75,9 +74,8 @@ def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
 
 
 def exposure_stops(paths: Sequence[Path]) -> list[float]:
-    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown. An entry
-    that most photographs lack (f-number of manual lenses, ISO of some cameras) counts as equal for all. Photographs
-    with other entries than most are NaN."""
+    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown, or with
+    other entries than most. What most lack, as the f-number of manual lenses, counts as equal for all."""
     settings = in_threads(lambda path: from_header(path, exposure_settings, ()), paths)
     stated = [tuple(value is not None for value in entry) for entry in settings]
     (usual, _), *_ = Counter(filter(None, stated)).most_common(1) or [((), 0)]
@@ -87,9 +85,8 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
     """Read a photograph of `stored` width and height (None = any) as 8-bit sRGB, mode RGB, or RGBA with transparency,
-    downscaled to those `wanted` by averages over pixels: a JPEG is decoded at a half, a quarter or an eighth of its
-    size if that is at least twice as large. Grey of more than 8 bits, which PIL would clip to white, is scaled to 8.
-    Raises CaptureError: it is missing, cannot be read, or has another size."""
+    reduced to those `wanted` by averages over pixels; JPEGs are decoded at about twice these. Raises CaptureError: it
+    is missing, cannot be read, or has another size."""
     try:
         with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:
@@ -122,8 +119,7 @@ def eight_bits(image: Image.Image) -> Image.Image:
 
 
 def to_bytes(values: npt.NDArray[np.float64], whites: Sequence[float], what: str) -> npt.NDArray[np.uint8]:
-    """Scale non-negative numbers to bytes; white is the smallest of `whites` that bounds them. Raises ValueError, with
-    `what` they are: none does."""
+    """Scale numbers to bytes; white is the smallest of `whites` that bounds them. Raises ValueError: none does."""
     low, high = float(values.min()), float(values.max())
     white = next((white for white in whites if high <= white), None)
     if white is None or not low >= 0.0:  # also NaN

@@ -1,5 +1,4 @@
-"""Table of what files and folders of a capture are, by their names and what lies beside them: kinds.yaml, which
-`folder_contents.py` applies."""
+"""Table of what files and folders of a capture are: kinds.yaml, which `folder_contents.py` applies."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -29,10 +29,9 @@ MIRROR = np.diag([1.0, 1.0, -1.0])
 def triangulate(
     capture: Path, views: Sequence[Photograph], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs with known cameras, in pixels of the files, which are not refined; return the
-    folder of a COLMAP model in the world of the poses, with image names relative to `capture`. The model is cached, and
-    an interrupted run resumed, as by `find_poses`. Raises CaptureError: too few points can be found; says what may be
-    wrong; KeyboardInterrupt: Ctrl-C; what is done is kept."""
+    """Triangulate points from photographs with known cameras, in pixels of the files; return the folder of a COLMAP
+    model in the world of the poses, with names relative to `capture`. It is cached, and interrupted runs resumed.
+    Raises CaptureError: too few points can be found."""
     check_photographs_exist(capture, [view.file for view in views])
     if len(views) < 2:
         fail(f"{capture}: points need at least two photographs with poses, these are {len(views)}")

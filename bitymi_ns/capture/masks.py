@@ -27,9 +27,8 @@ MIDDLE = 127  # threshold of lossy masks, of 255
 
 def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downscale: int = 1) -> Path | None:
     """Find the folder of masks: `stated`, else the first `masks` or `mask` beside the folder `photographs`, in it, or
-    in `data`; else that of reduced masks (`masks_2` for a `downscale` of 2). If `data` is the folder of photographs, or
-    in it, one beside it is used if the folder has a usual name: `bed/masks` for `bed/images`, but not `all/masks` for
-    `all/bed`. Raises CaptureError: neither the stated one nor its reduced one exists."""
+    in `data`; else that of reduced masks (`masks_2`). Beside `data` itself it counts only if that has a usual name:
+    `bed/masks` for `bed/images`, not `all/masks` for `all/bed`. Raises CaptureError: `stated` is missing."""
     shown, named = Path(os.path.abspath(photographs)), Path(os.path.abspath(data))
     folders = [shown, named]
     if shown.name in USUAL_FOLDERS or not named.is_relative_to(shown):
@@ -93,8 +92,7 @@ def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
 
 
 def checked_mask(path: Path) -> Image.Image:
-    """Read a mask as a 1-bit image, True where pixels count, see `mask_pixels`; instant-ngp's are inverted. Raises
-    CaptureError: it is missing, or cannot be read."""
+    """Read a mask as a 1-bit image, True where pixels count. Raises CaptureError: it is missing, or cannot be read."""
     if not path.exists():
         fail(f"the mask {path} is missing")
     with parsing(f"the mask {path}", "Replace it, or remove the masks from the capture."), open_picture(path) as image:
@@ -109,10 +107,9 @@ def with_masks(
     downscale: int = 1,
     images: Path | None = None,
 ) -> list[Photograph]:
-    """Add masks to photographs, see `find_masks`, and report it. Masks beside photographs may be some. Raises
-    CaptureError: the folder has masks of some photographs only, or of none and is `stated`, relative to the capture, or
-    that of a model. `base`: folder in which the photographs' paths name the masks, None = their common one; `images`:
-    folder of a model's files, which have the names of those in `base`."""
+    """Add masks to photographs, see `find_masks`, and report it. Raises CaptureError: a folder has masks of some only,
+    or of none and is `stated` or that of a model. `base`: folder in which the photographs' paths name the masks, None =
+    their common one; `images`: folder of a model's files, named as in `base`."""
     files = [each.file for each in photographs]
     base = base or Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))
     names = [os.path.normpath(os.path.relpath(file, images or base)) for file in files]

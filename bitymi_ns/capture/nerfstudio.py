@@ -20,8 +20,7 @@ CLOUD = "sparse_pc.ply"
 
 def write_capture(poses: FoundPoses, folder: Path, progress: Progress) -> None:
     """Write `images`, `sparse/0`, transforms.json, the point cloud and the report into a new or an empty folder.
-    Cameras are distorted like the copied photographs, which parsers undistort on loading. There is no
-    applied_transform: COLMAP model, cameras and points share one world with z up. Raises OSError: it cannot be written;
+    Cameras keep the photographs' distortion; all share one world with z up. Raises OSError: it cannot be written;
     ValueError: the folder holds something, or a name in the model leads out of it."""
 
     def check() -> None:

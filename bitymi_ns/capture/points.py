@@ -1,7 +1,6 @@
 """Point clouds: read PLY files, choose one, and color points by photographs.
 
-nerfstudio's PLY reader returns uninitialized memory for missing points, and divides all colors by 255, even those in
-[0, 1].
+nerfstudio's PLY reader returns uninitialized memory for missing points, and divides all colors by 255.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,8 +41,7 @@ class Points(NamedTuple):
 
 
 def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.NDArray[np.uint8], str]:
-    """Convert colors [N, 3] to bytes, see `to_bytes`; without a usual white return [0, 3] and the reason. Non-finite
-    `values` become 0 in place."""
+    """Convert colors [N, 3] to bytes, else to [0, 3] with the reason. Non-finite `values` become 0 in place."""
     values[~np.isfinite(values)] = 0.0
     try:
         return to_bytes(values, WHITES[floating], "colors") if len(values) else values.astype(np.uint8), ""
@@ -114,8 +112,7 @@ def with_colors(points: Points, without: str, photographs: Sequence[Photograph],
 
 
 def color_points(points: Points, photographs: Sequence[Photograph]) -> Points:
-    """Color each point by the median over those of `COLOR_VIEWS` photographs that it projects into, robust to those in
-    which it is hidden; grey if it projects into none."""
+    """Color each point by the median over those of COLOR_VIEWS photographs that it projects into; grey without any."""
     chosen = [photographs[i] for i in spread(len(photographs), COLOR_VIEWS)]
     reduced = (read_image(each.file, wanted=each.camera.within(COLOR_SIDE)) for each in chosen)
     images = [np.asarray(image.convert("RGB")) for image in reduced]

@@ -25,10 +25,9 @@ format's unit."""
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
-    """Recover rotations from the 3 x 3 parts [N, 3, 3] of poses, camera to world; valid ones stay equal. Divide out
-    each matrix's common factor, and undo rounding by the nearest rotation. Mirrored rotations (determinant -1) stay
-    mirrored, as whole captures may be. `names` of the frames and `source` are for messages. Raises CaptureError: a
-    matrix is not finite, zero or sheared."""
+    """Recover rotations, or mirrored ones, from the 3 x 3 parts [N, 3, 3] of poses, camera to world: divide out each
+    matrix's factor, and undo rounding by the nearest rotation; valid ones stay equal. `names` of the frames and
+    `source` are for messages. Raises CaptureError: a matrix is not finite, zero or sheared."""
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
     largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares of the numbers may overflow

@@ -46,10 +46,9 @@ def find_poses(
     warn: Tell = warnings.warn,
     capture: Path | None = None,
 ) -> FoundPoses:
-    """Find camera poses of photographs (of a folder, or its `images`) or of a video's frames; cache them beside the
-    photographs, or in the user's cache folder if nothing can be written there; continue an interrupted run. `warn` is
-    told what is left out; `capture`: folder that may hold the masks, too. Raises CaptureError: no poses can be found;
-    says what to photograph differently; KeyboardInterrupt: Ctrl-C; what is done is kept."""
+    """Find camera poses of photographs (of a folder, or its `images`) or of a video's frames; cache them, and continue
+    an interrupted run. `warn` is told what is left out; `capture`: folder that may hold the masks, too. Raises
+    CaptureError: no poses can be found; says what to photograph differently."""
     options = options or SfmOptions()
     tell = progress or no_progress
     source, folder, names = _photographs_in(Path(source))
@@ -167,9 +166,8 @@ def _find(
 
 
 def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str], model: str, warn: Tell) -> list[Photo]:
-    """Decide of the photographs of a size in a folder together if they are 360-degree pictures: by the camera `model`
-    if it is stated, or as a quarter of them or most of their edges tell. Leave out panoramas of another shape, which do
-    not show all directions; fail if most are."""
+    """Decide of the photographs of a size in a folder together if they are 360-degree pictures: by the camera `model`,
+    or as a quarter of them or most of their edges tell. Leave out panoramas of another shape; fail if most are."""
     groups: dict[tuple[str, int, int], list[Photo]] = defaultdict(list)
     for photo in photos:
         groups[os.path.dirname(photo.name), photo.width, photo.height].append(photo)
@@ -210,9 +208,8 @@ def make_job(
     work: Path,
     sequence: bool,
 ) -> Job:
-    """Make the job of these photographs in their order, linked in the work folder under names without spaces for
-    COLMAP. `images`: folder of the upright photographs, `used` their names in it; in a `sequence` neighbours
-    overlap."""
+    """Make the job of these photographs in their order, linked in the work folder under plain names. `images`: folder
+    of the upright photographs, `used` their names in it; in a `sequence` neighbours overlap."""
     links = emptied(work / "links")
     plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
     for photo in photos:

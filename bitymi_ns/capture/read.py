@@ -57,8 +57,7 @@ BLENDER_SIDE = 1.5  # half the side of a Blender data set's box, as in nerfstudi
 
 
 def check_options(options: Any, call: Callable[[str], str] = str) -> None:
-    """Check the options of any reader of captures that it has; `call` gives the caller's name of an option. Raises
-    CaptureError: one is out of range."""
+    """Check the options that a reader of captures has; `call` names one in messages. Raises CaptureError."""
     mode = getattr(options, "eval_mode", None)
     for name, used, is_valid, what in (
         ("scale_factor", True, lambda value: 0.0 < value < math.inf, "above 0"),
@@ -155,9 +154,8 @@ def read_capture(
     options: CaptureOptions, need_photos: bool = True, want_points: bool = True, found: Found | None = None
 ) -> Capture:
     """Read a capture of any format, and check all that its files state. `need_photos`: fail if photographs are missing,
-    else their files are not opened; `want_points`: color the points, and triangulate missing ones; `found`: what
-    `options.find` has found. Raises CaptureError: it cannot be used; names the file and the entry, and says what to
-    do."""
+    else open none; `want_points`: color and triangulate points; `found`: what `options.find` has found. Raises
+    CaptureError: it cannot be used; names the file and the entry, and says what to do."""
     return _Reader(options, found or options.find(), need_photos, want_points).read()
 
 

@@ -186,8 +186,7 @@ def _match(cameras: Sequence[ColmapCamera], i: int, j: int, a: Features, b: Feat
 
 
 def rays_of(pairs: Sequence[Pair], cameras: Sequence[ColmapCamera]) -> list[tuple[Array, Array, Array]]:
-    """Compute the unit rays [n, 3] of each pair's matches in both cameras' axes (OpenCV), and the tolerances [n] at the
-    second one, radians; `cameras` of all photographs."""
+    """Compute unit rays [n, 3] of pairs' matches in both cameras' axes, and tolerances [n] at the second, radians."""
     lenses = {camera: camera.colmap for camera in dict.fromkeys(cameras)}
     rays = []
     for pair in pairs:
@@ -258,9 +257,8 @@ def as_meant(
     photographs: Sequence[Photograph], written: Reading, frame: Array, source: str, asked: str
 ) -> tuple[list[Photograph], Array, str]:
     """Give photographs the poses and intrinsics of the reading `asked` for (AUTO = the photographs decide), and say so;
-    return them, the reflection [4, 4] of their world (the identity unless it was left-handed), and the reading's name.
-    `frame`: transform [4, 4] from the world of the files to that of the photographs. Raises CaptureError: the format
-    has no such reading."""
+    return them, the reflection [4, 4] of their world, and the reading's name. `frame`: transform [4, 4] from the world
+    of the files to that of the photographs. Raises CaptureError: the format has no such reading."""
     named = {WRITTEN: written} | {each.name: each for each in readings(written)}
     poses, decision = np.linalg.inv(frame) @ np.stack([each.pose for each in photographs]), Decision(named.get(asked))
     if asked == AUTO:

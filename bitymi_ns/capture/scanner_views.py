@@ -1,5 +1,4 @@
-"""Read photographs with poses of Polycam, Record3D, 3D Scanner App and Stray Scanner, and of folders with a text file
-per pose (ScanNet, 7-Scenes)."""
+"""Read photographs with poses of scanning programs, and of folders with a text file per pose (ScanNet, 7-Scenes)."""
 
 import csv
 from collections.abc import Callable, Sequence

@@ -1,7 +1,6 @@
 """Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each.
 
-360-degree (equirectangular) pictures are told by metadata or content, not by their aspect ratio of 2 alone: phones take
-other photographs with it.
+360-degree pictures are told by metadata or content: phones take other photographs with an aspect ratio of 2.
 """
 
 import os
@@ -134,8 +133,7 @@ def has_panorama_metadata(path: Path) -> bool:
 
 
 def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
-    """Test if left and right edge continue each other, and first and last row are constant, in grey levels [h, w] to
-    255 of a picture reduced to some hundreds of pixels."""
+    """Test if left and right edge of a reduced grey picture [h, w] continue each other, and the poles are constant."""
     return seam(grey) > ALIKE and bool(max(grey[0].std(), grey[-1].std()) <= POLE * grey.std())
 
 
@@ -226,8 +224,7 @@ def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
 
 
 def shift(first: np.ndarray, second: np.ndarray) -> float:
-    """Estimate the shift, in pixels, that explains the difference of two images [h,w]: the root mean square of the
-    difference over that of the gradient."""
+    """Estimate the shift, in pixels, of two images [h,w]: root mean square of the difference over the gradient's."""
     gradient = np.mean(np.diff(first, axis=0) ** 2) + np.mean(np.diff(first, axis=1) ** 2)
     difference = np.mean((first - second) ** 2)
     return float(np.sqrt(difference / gradient)) if gradient > 0 else (0.0 if difference == 0 else np.inf)

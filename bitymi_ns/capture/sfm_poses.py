@@ -1,5 +1,4 @@
-"""Poses of photographs and videos by structure from motion, and the copy that a training run keeps, to be resumed
-with the same poses."""
+"""Poses of photographs and videos by structure from motion, and the copy that a training run keeps."""
 
 import json
 import os

@@ -107,8 +107,7 @@ def by_mode(names: Sequence[Path], mode: Mode, interval: int, fraction: float) -
 
 
 def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split:
-    """Hold out photographs by name, with leading folders where the name alone matches several. Raises CaptureError: a
-    name matches no photograph, or several."""
+    """Hold out photographs by name. Raises CaptureError: a name matches no photograph, or several."""
     held_out = set(find_named(names, wanted, source))
     return Split(sorted(set(range(len(names))) - held_out), sorted(held_out), f"by {source}")
 

@@ -1,7 +1,6 @@
 """Read the JSON files of captures: nerfstudio's transforms.json, instant-ngp's, and Blender's.
 
-They state focal lengths and names of photographs differently; each entry is read from the frame first, then from the
-top of the file. Unused entries are reported.
+Each entry is read from the frame first, then from the top of the file. Unused entries are reported.
 """
 
 import math
@@ -173,8 +172,7 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
 
 
 def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
-    """Convert an entry, also in quotes, to a number. Raises CaptureError: it is none, no number of pixels (w, h), or no
-    positive one (applied_scale, aabb_scale)."""
+    """Convert an entry, also in quotes, to a number. Raises CaptureError: it is none, or none of its kind."""
     try:
         number = float("" if isinstance(value, bool) else value)
     except (TypeError, ValueError, OverflowError):

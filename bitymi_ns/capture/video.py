@@ -58,9 +58,8 @@ def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -
 
 
 def extract_frames(video: Path, work: Path, count: int | None, progress: Progress, upright: bool = True) -> Path:
-    """Write `count` frames of a video, or one per STRIDE of motion, turned `upright` or as stored, as JPEGs to `images`
-    in the work folder, whole or not at all: frame_000012.jpg is number 12, counted from 0. Raises CaptureError: it
-    cannot be read, or nothing moves in it."""
+    """Write `count` frames of a video, or one per STRIDE of motion, `upright` or as stored, to `images` in the work
+    folder, whole or not at all: frame_000012.jpg is number 12, from 0. Raises CaptureError: nothing moves in it."""
     target = work / IMAGES
     if target.is_dir():
         return target
@@ -126,8 +125,7 @@ def _survey(video: Path, progress: Progress) -> tuple[list[int], list[float], li
 
 
 def displacement(first: np.ndarray, second: np.ndarray) -> float:
-    """Measure the mean displacement of image blocks by phase correlation, in longer sides; blocks without texture count
-    as still, as do images of different sizes."""
+    """Measure the mean displacement of image blocks by phase correlation, in longer sides; bare ones are still."""
     if first.shape != second.shape:
         return 0.0
     height, width = np.minimum(max(16, min(first.shape) // 3), first.shape)

@@ -1,5 +1,4 @@
-"""Check a model: cameras that no points link to the others, matches that contradict the poses; explain why photographs
-have no pose, and what to photograph differently."""
+"""Check a model, and explain why photographs have no pose, and what to photograph differently."""
 
 from collections import Counter
 from dataclasses import dataclass

@@ -1,5 +1,4 @@
-"""Map matched photographs: all cameras at once, else one after the other, then bundle adjustment; or triangulate points
-for known cameras."""
+"""Map matched photographs: all at once, else one after the other; or triangulate points for known cameras."""
 
 import copy
 import shutil
@@ -101,8 +100,7 @@ def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) ->
 
 
 def refined(model: pycolmap.Reconstruction, job: Job) -> pycolmap.Reconstruction:
-    """Drop bad observations, adjust all cameras and points of a `model` in place, and drop again; return it, or a copy
-    with OPENCV cameras if these fit clearly better."""
+    """Adjust cameras and points of a `model` in place; return it, or one with OPENCV cameras that fits better."""
     _filter(model, job.pixel)
     if model.num_points3D() == 0:
         return model

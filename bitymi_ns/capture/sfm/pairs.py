@@ -126,8 +126,7 @@ def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
 
 
 def nearest_neighbours(alike: np.ndarray, neighbours: int) -> set[tuple[int, int]]:
-    """Pair each photograph with those most alike, and along a tree of the best pairs, which connects all; `alike` [n,n]
-    is symmetric, 0 = nothing shared."""
+    """Pair each photograph with those most alike [n,n] (0 = nothing shared), and along a tree that connects all."""
     pairs = set()
     for i, row in enumerate(alike):
         best = np.argsort(-row, kind="stable")[:neighbours]

@@ -1,7 +1,7 @@
 """Run COLMAP in this process, by `main`: a Job on stdin, lines of JSON on stdout.
 
 A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends with its
-stdin, so that nothing goes on after its parent was killed. Prints of COLMAP and its libraries go to stderr.
+stdin. Prints of COLMAP and its libraries go to stderr.
 """
 
 import json

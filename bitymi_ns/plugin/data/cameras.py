@@ -16,9 +16,8 @@ POSSIBLE_VIEW = (0.01, 178.0)  # view angles of accepted focal lengths, degrees
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
-    """Convert one of nerfstudio's cameras, of shape () or (1,) (OpenGL axes: x right, y up, z backward), to
-    world-to-camera in OpenCV axes, on `device` or its own. Raises InputError: it is not a perspective camera, or has
-    distortion."""
+    """Convert one of nerfstudio's cameras (OpenGL axes: x right, y up, z backward) to world-to-camera in OpenCV axes.
+    Raises InputError: it is not a perspective camera, or has distortion."""
     cameras = cameras.reshape((-1,))
     if cameras.shape[0] != 1:
         raise ValueError(f"expected one camera, found {cameras.shape[0]}")

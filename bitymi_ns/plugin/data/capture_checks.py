@@ -40,8 +40,7 @@ STOCK_IGNORED = ("_target", "depths_path", "max_2D_matches_per_3D_point",
 
 
 def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
-    """Translate one of nerfstudio's parsers to `bitymi-data`, which checks more, unless that lacks its format or an
-    option that is set."""
+    """Translate one of nerfstudio's parsers to `bitymi-data`, unless that lacks its format or an option that is set."""
     format = STOCK_FORMATS.get(type(config))
     if format is None:
         return config
@@ -62,9 +61,8 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 @as_input_error()
 def check_capture(config: FullImageDatamanagerConfig, trains: bool = True) -> None:
-    """Check that there is a capture at the data manager's path, and make its parser that of `bitymi_parser`, ready to
-    read. `trains`: with points to start from; and the command has an option for the path, --data. Raises InputError:
-    there is none, or an option is out of range."""
+    """Check that there is a capture at the data manager's path, and prepare its parser; `trains`: with points to start
+    from. Raises InputError: there is none, or an option is out of range."""
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
@@ -78,8 +76,7 @@ def check_capture(config: FullImageDatamanagerConfig, trains: bool = True) -> No
 
 @as_input_error()
 def read_early(config: FullImageDatamanagerConfig) -> Capture | None:
-    """Read the views of a checked capture for a training, if it comes with poses, which takes little time; else None.
-    Raises InputError: it cannot be used."""
+    """Read a checked capture for a training if it comes with poses; else None. Raises InputError: it cannot be used."""
     if not isinstance(config.dataparser, BitymiDataParserConfig):
         return None
     parser = config.dataparser.prepare(points=True)

@@ -250,8 +250,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return lambda camera: carried(camera, given, motions)
 
     def corrections(self, state: Mapping[str, Any] | None) -> list[list[Tensor | None]]:
-        """Return the color corrections of the training and of the held-out views (`Exposure.at`), by the state of a
-        run's `Exposure`."""
+        """Return the color corrections of training and held-out views, by the state of a run's `Exposure`."""
         train, held_out = self.train_dataset.facts.files, self.eval_dataset.facts.files
         exposure = restored(state, len(train), train)
         return [[exposure.at(file) for file in files] for files in (train, held_out)]

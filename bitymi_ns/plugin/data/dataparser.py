@@ -1,5 +1,4 @@
-"""Parsers: `bitymi-data`, the methods' default, reads a folder or file of any format and splits its views by one rule;
-cameras of a bundle serve where the capture is gone."""
+"""Parsers: `bitymi-data` reads a capture of any format; a bundle's cameras serve where the capture is gone."""
 
 from dataclasses import dataclass, field
 from functools import cached_property

@@ -152,8 +152,7 @@ class CachedImages(OnDemand[dict[str, Any]]):
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-    """Leave out fully masked views; `split` is "training" or "held-out". Raises InputError: no training view is
-    left."""
+    """Leave out fully masked views; `split`: "training" or "held-out". Raises InputError: no training view is left."""
     masks = outputs.mask_filenames
     if not masks:
         return outputs
@@ -178,8 +177,7 @@ def capture_fingerprint(dataset: BitymiDataset) -> dict[str, Any]:
 
 
 def warn_of_other_capture(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> None:
-    """Warn if a run that is resumed, measured or exported reads another capture, by fingerprints; checkpoints of
-    earlier versions have none."""
+    """Warn if a run that is resumed, measured or exported reads another capture, by fingerprints (None = unknown)."""
     if before is None:
         return
     if before["views"] != now["views"]:

@@ -126,8 +126,7 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> Sequence[DepthFit | None] | None:
-    """Fit each map to points [N, 3]; with too few, take it as metric, with `unit` scene units per metre. None = depth
-    is unused."""
+    """Fit each map to points [N, 3]; few = metric, of `unit` scene units per metre. None = depth is unused."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None

@@ -97,8 +97,7 @@ def _split(
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
     """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale after it.
-    Center in float64 before nerfstudio's functions: UTM or ECEF positions have seven digits before the point, all of
-    float32's."""
+    UTM or ECEF positions, with seven digits before the point, are centered in float64 before nerfstudio's functions."""
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
@@ -156,8 +155,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
-    """Downscale views of more than `longest` pixels along a side (0 = no limit), in their lenses. Raises InputError:
-    `longest` is negative."""
+    """Downscale views of more than `longest` pixels along a side (0 = no limit). Raises InputError: it is negative."""
     if longest < 0:
         fail(f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 for no limit.")
     facts = CaptureFacts.of(outputs.metadata)

@@ -31,6 +31,6 @@ DYNAMIC, MASK, _ = OF_MASKS
 RESULTS, UNREAD, OTHERS, POSES = (_TABLE[name] for name in ("RESULTS", "UNREAD", "OTHERS", "POSES"))
 BUNDLE, RUN, _, _, RENDERS = RESULTS
 IMAGES_OF, CLOUDS, LISTS = (_TABLE[name] for name in ("IMAGES_OF", "CLOUDS", "LISTS"))
-NSVF, PROCESSED = (_TABLE[name] for name in ("NSVF", "PROCESSED"))
+NSVF, PROCESSED, SCANS = (_TABLE[name] for name in ("NSVF", "PROCESSED", "SCANS"))
 FILM = Kind("", "a film of ns-render")
 SPLITS = ("train", "val", "test", "train+test")  # folders of ns-render, in which RENDERS marks it

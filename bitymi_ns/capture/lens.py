@@ -16,7 +16,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say
+from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say, scaled_size
 from bitymi_ns.trust import listed
 
 MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
@@ -64,7 +64,12 @@ class Pinhole(NamedTuple):
     def rays(self) -> npt.NDArray[np.float64]:
         """[H, W, 3] rays through the pixels' centres, of z 1, OpenCV axes."""
         x, y = (np.arange(self.width) + 0.5 - self.cx) / self.fx, (np.arange(self.height) + 0.5 - self.cy) / self.fy
-        return np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1)
+        return _through(x, y[:, None])
+
+
+def _through(x: npt.ArrayLike, y: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Make the rays [..., 3] through the points (x, y, 1)."""
+    return np.stack(np.broadcast_arrays(x, y, 1.0), -1)
 
 
 @dataclass(frozen=True)
@@ -123,9 +128,7 @@ class Lens:
         if not in_proportion(size, self.stored):
             fail(wrong_size(path, size, self.stored))
         values = cv2.resize(values, self.camera.size, interpolation=cv2.INTER_NEAREST_EXACT)
-        if self.distorts:
-            values = self._moved(values, cv2.INTER_NEAREST)
-        return values
+        return self._moved(values, cv2.INTER_NEAREST) if self.distorts else values
 
     def _moved(self, pixels: npt.NDArray[Any], interpolation: int) -> npt.NDArray[Any]:
         if self.face:
@@ -145,21 +148,20 @@ class Lens:
         for start in range(0, to.height, BAND):
             rows = min(BAND, to.height - start)
             y = (start + (np.arange(rows * samples) + 0.5) / samples - to.cy) / to.fy
-            rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], 1.0), -1).reshape(-1, 3) @ FACES[self.face]
-            at = self.camera.pixels_of(rays).astype(np.float32).reshape(len(y), len(x), 2)
-            at += np.array([pad - 0.5, -0.5], np.float32)
-            band = cv2.remap(pixels, at, NO_MAP, how, borderMode=cv2.BORDER_REPLICATE)
+            rays = _through(x, y[:, None]).reshape(-1, 3) @ FACES[self.face]
+            positions = self.camera.pixels_of(rays).astype(np.float32).reshape(len(y), len(x), 2)
+            positions += np.array([pad - 0.5, -0.5], np.float32)
+            band = cv2.remap(pixels, positions, NO_MAP, how, borderMode=cv2.BORDER_REPLICATE)
             bands.append(band if nearest else cv2.resize(band, (to.width, rows), interpolation=cv2.INTER_AREA))
         return np.concatenate(bands)
 
     def downscaled(self, factor: float) -> Lens:
         """Return the lens for pictures scaled by `factor`."""
-        of = self.pinhole
-        width, height = max(1, round(of.width * factor)), max(1, round(of.height * factor))
-        x, y = width / of.width, height / of.height
-        pinhole = Pinhole(of.fx * x, of.fy * y, of.cx * x, of.cy * y, width, height)
-        camera = self.camera.rescaled(*(max(1, round(side * factor)) for side in self.camera.size))
-        return replace(self, camera=camera, pinhole=pinhole)
+        whole = self.pinhole
+        width, height = scaled_size((whole.width, whole.height), factor)
+        x, y = width / whole.width, height / whole.height
+        pinhole = Pinhole(whole.fx * x, whole.fy * y, whole.cx * x, whole.cy * y, width, height)
+        return replace(self, camera=self.camera.rescaled(*scaled_size(self.camera.size, factor)), pinhole=pinhole)
 
 
 def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list[Lens]:
@@ -198,8 +200,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
     lenses, messages = [], []
     for photograph, size in zip(photographs, sizes, strict=True):
         camera = photograph.camera
-        full = camera.size
-        small = (max(1, round(full[0] / downscale)), max(1, round(full[1] / downscale)))
+        small = scaled_size(camera.size, 1 / downscale)
         if size is not None and max(abs(size[0] - small[0]), abs(size[1] - small[1])) > 1:
             camera_is = f"but 1/{downscale} of its camera's is {small[0]} x {small[1]}"
             advice = f"Make {photograph.file.parent} again, or leave --downscale-factor out."
@@ -207,7 +208,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
         used = size or small
         key = (camera, used, photograph.downscaled)
         if key not in made:
-            stored = used if photograph.downscaled else full
+            stored = used if photograph.downscaled else camera.size
             made[key] = lenses_of(camera.rescaled(*used), stored, photograph.label)
             if made[key][0].face or camera.colmap.is_perspective_fisheye():
                 sizes_of = [f"{x.face} {x.pinhole.width} x {x.pinhole.height}".strip() for x in made[key]]
@@ -226,8 +227,7 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int]) -> list[Lens]:
     around = colmap.width / (2.0 * math.pi)
     fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
     t = np.linspace(-1.0, 1.0, NODES)  # in focal lengths
-    rays = np.stack(np.broadcast_arrays(t[None, :], t[:, None], 1.0), -1)
-    lenses = []
+    rays, lenses = _through(t, t[:, None]), []
     for face in FACES:
         seen = covered(colmap, face, rays)
         if seen.mean() < LEAST_SHARE:
@@ -248,7 +248,7 @@ def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
     reach = np.zeros(4)
 
     def seen(x: npt.ArrayLike, y: npt.ArrayLike) -> bool:
-        return bool(covered(camera, "front", np.stack(np.broadcast_arrays(x, y, 1.0), -1)).all())
+        return bool(covered(camera, "front", _through(x, y)).all())
 
     for side, (x, y) in enumerate(((-most, 0.0), (most, 0.0), (0.0, -most), (0.0, most))):
         reach[side] = most * _largest(lambda s, x=x, y=y: seen(s * x, s * y))
@@ -274,8 +274,8 @@ def _maps(lens: Lens) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
     """Compute fixed-point maps (int16, uint16) for cv2.remap: positions in the photograph of the result's pixels."""
     to = lens.pinhole
     x, y = (np.arange(0, size + NODE_STEP, NODE_STEP) + 0.5 for size in (to.width, to.height))
-    rays = np.stack(np.meshgrid((x - to.cx) / to.fx, (y - to.cy) / to.fy), -1).reshape(-1, 2)
-    nodes = lens.camera.pixels_of(np.concatenate([rays, np.ones((len(rays), 1))], 1)) - 0.5
+    rays = _through((x - to.cx) / to.fx, (y[:, None] - to.cy) / to.fy)
+    nodes = lens.camera.pixels_of(rays.reshape(-1, 3)) - 0.5
     nodes = nodes.reshape(len(y), len(x), 2).astype(np.float32)
     scale = np.array([[1.0 / NODE_STEP, 0.0, 0.0], [0.0, 1.0 / NODE_STEP, 0.0]])
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

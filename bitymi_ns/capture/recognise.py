@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from bitymi_ns.capture import folder_contents
-from bitymi_ns.capture.kinds import OTHERS, PHOTOGRAPHS, UNREAD, VIDEOS
+from bitymi_ns.capture.kinds import OTHERS, PHOTOGRAPHS, SCANS, UNREAD, VIDEOS
 from bitymi_ns.capture.types import fail
 from bitymi_ns.safe_reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
@@ -132,19 +132,13 @@ def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
 
 def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     """Yield captures of scanning programs, and RGB-D sets with poses."""
-    keyframes = folder / "keyframes" if (folder / "keyframes").is_dir() else folder
-    if any((keyframes / i).is_dir() and any((keyframes / c).glob("*.json")) for i, c in POLYCAM):
-        yield "polycam", folder
-    if any(folder_contents.holds(folder / name, b'"poses"', MOST_TEXT) for name in ("metadata", "metadata.json")):
-        yield "record3d", folder
-    first = min(folder.glob("frame_*.json"), default=None)
-    if first is not None and folder_contents.holds(first, b'"cameraPoseARFrame"', MOST_TEXT):
-        yield "3d-scanner", folder
-    if all((folder / name).is_file() for name in STRAY):
-        yield "stray-scanner", folder
-    pictures = any((folder / name).is_dir() for name in ("color", "rgb", "images"))
-    if (pictures and any((folder / "pose").glob("*.txt"))) or any(folder.glob("*.pose.txt")):
-        yield "pose-files", folder
+    scanned = set()
+    for row in SCANS:
+        files = [path for name in row.names.split() for path in sorted(folder.glob(name))[:1]]
+        complete = len(files) == len(row.names.split())
+        if complete and (not row.mark or folder_contents.holds(files[0], row.mark.encode(), MOST_TEXT)):
+            scanned.add(row.what)
+    yield from ((format, folder) for format in get_args(Format) if format in scanned)
 
 
 def _kind_of(file: Path) -> Format:

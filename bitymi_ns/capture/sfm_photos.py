@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
 from bitymi_ns.capture.folder_contents import open_picture, photographs_below
 from bitymi_ns.capture.image_files import eight_bits, in_srgb
 from bitymi_ns.capture.order import natural
-from bitymi_ns.capture.types import CaptureError, fail, is_full_sphere
+from bitymi_ns.capture.types import CaptureError, fail, is_full_sphere, scaled_size
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.safe_reading import open_regular, why
@@ -125,11 +126,9 @@ def read_photo(folder: Path, name: str) -> Photo:
 
 def has_panorama_metadata(path: Path) -> bool:
     """Test a file's metadata for a spherical or cylindrical projection."""
-    try:
-        with open_regular(path) as file:
-            return SPHERICAL.search(file.read(HEADER)) is not None
-    except OSError:
-        return False
+    with suppress(OSError), open_regular(path) as file:
+        return SPHERICAL.search(file.read(HEADER)) is not None
+    return False
 
 
 def looks_panoramic(grey: npt.NDArray[np.float32]) -> bool:
@@ -153,9 +152,8 @@ def is_plain(image: Image.Image, path: Path) -> bool:
     return path.suffix.lower() in PLAIN.get(image.format or "", ())
 
 
-def _reduced(image: Image.Image, size: int) -> Image.Image:
-    scale = min(1.0, size / max(image.size))
-    return image.resize((max(1, round(image.width * scale)), max(1, round(image.height * scale))), Image.Resampling.BOX)
+def _reduced(image: Image.Image, side: int) -> Image.Image:
+    return image.resize(scaled_size(image.size, min(1.0, side / max(image.size))), Image.Resampling.BOX)
 
 
 def sharpness(grey: np.ndarray) -> float:
@@ -186,7 +184,7 @@ def upright_photos(
     target = work / IMAGES
     if not target.is_dir():
         with complete_folder(target) as new:
-            for i, photo in enumerate(photos):
+            for i, photo in enumerate(photos, 1):
                 progress("turning photographs upright", i, len(photos))
                 path = new / names[photo.name]
                 path.parent.mkdir(parents=True, exist_ok=True)
@@ -197,7 +195,6 @@ def upright_photos(
                 else:
                     picture = upright(photo)
                     picture.save(path, quality=JPEG_QUALITY, subsampling=0, exif=picture.info["exif"])
-            progress("turning photographs upright", len(photos), len(photos))
     return target, names
 
 

@@ -134,10 +134,9 @@ def _translate(path: Path, holder: dict[str, Any]) -> None:
         holder.setdefault(key, matrix[i][j])
     if "camera_model" in holder:
         return
-    for key in EQUAL_AREA:
-        if holder.get(key):
-            what = f"{path}: {key} is set, which means rows of equal areas, which cannot be read"
-            fail(f'{what}. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.')
+    for key in filter(holder.get, EQUAL_AREA):
+        what = f"{path}: {key} is set, which means rows of equal areas, which cannot be read"
+        fail(f'{what}. For rows of equal angles write "camera_model": "EQUIRECTANGULAR" instead.')
     stated = [model if holder[key] else "OPENCV" for key, model in MODELS.items() if key in holder]
     if stated:
         holder["camera_model"] = min(stated, key="OPENCV".__eq__)
@@ -149,8 +148,8 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
     if isinstance(frames, dict):
         fail(f"{path}: frames is an object with names, not a list. Write its values as a list, in brackets.")
     if not isinstance(frames, list) or not frames:
-        other = "This format needs some in each of its files, those of held-out views as well: move a few frames there."
-        fail(f"{path} lists no frames: the capture has no images with poses. {HOW_TO_GET_ONE if own_format else other}")
+        advice = HOW_TO_GET_ONE if own_format else "Each file of this format needs some: move a few frames there."
+        fail(f"{path} lists no frames: the capture has no images with poses. {advice}")
     if own_format and len(frames) < 2:
         fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
     for i, frame in enumerate(frames):
@@ -252,10 +251,10 @@ def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tupl
         fail(f"{path}: the camera_model {model!r} {label} is unknown. {advice}")
     kind = CAMERA_TYPES[model]
     holder = frame if any(key in frame for key in DISTORTION) else meta
-    stated = holder.get("distortion_params")
-    if stated is None:
+    if "distortion_params" in holder:
+        stated = np.ravel(holder["distortion_params"]).tolist()
+        values = [check_number(path, "distortion_params", value, label) for value in stated]
+    else:
         values = [check_number(path, key, holder.get(key, 0.0), label) for key in COEFFICIENTS]
         values += [0.0] * (6 if kind == "FISHEYE624" else 0)
-    else:
-        values = [check_number(path, "distortion_params", each, label) for each in np.ravel(stated).tolist()]
     return colmap_distortion(kind, values, f"{label} in {path}")

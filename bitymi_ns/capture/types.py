@@ -61,6 +61,12 @@ def is_full_sphere(width: float, height: float) -> bool:
     return abs(width / (2.0 * height) - 1.0) <= ASPECT + 1.0 / height
 
 
+def scaled_size(size: tuple[int, int], factor: float) -> tuple[int, int]:
+    """Scale a width and a height in pixels, to at least 1."""
+    width, height = (max(1, round(side * factor)) for side in size)
+    return width, height
+
+
 class ColmapCamera(NamedTuple):
     """Camera model of COLMAP, width and height of the pictures in pixels, and parameters in COLMAP's order."""
 
@@ -88,8 +94,7 @@ class ColmapCamera(NamedTuple):
 
     def within(self, side: int) -> tuple[int, int]:
         """Return the size of pictures reduced to at most `side` pixels along the longer side."""
-        scale = min(1.0, side / max(self.size))
-        return max(1, round(self.width * scale)), max(1, round(self.height * scale))
+        return scaled_size(self.size, min(1.0, side / max(self.size)))
 
     def rescaled(self, width: int, height: int) -> "ColmapCamera":
         """Return the camera for the same pictures in another size."""

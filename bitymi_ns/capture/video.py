@@ -69,14 +69,13 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
     if motion[-1] < STILL:
         fail(f"{video} {NO_MOTION}")
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
-    chosen = choose(np.array(motion), np.array(sharp), wanted)
-    numbers = {seen[i] for i in chosen}
+    numbers = {seen[i] for i in choose(np.array(motion), np.array(sharp), wanted)}
     with complete_folder(target) as folder:
         with _opened(video) as container:  # pixels of some camcorders and anamorphic lenses are not square
             shape = float(_pictures(container).sample_aspect_ratio or 1.0)
             shape = shape if 0.25 < shape < 4.0 else 1.0
-        wanted_frames = islice((each for each in _frames(video) if each[0] in numbers), len(numbers))
-        for written, (number, frame) in enumerate(wanted_frames, 1):
+        chosen_frames = islice(((i, frame) for i, frame in _frames(video) if i in numbers), len(numbers))
+        for written, (number, frame) in enumerate(chosen_frames, 1):
             image = _picture(frame, shape)
             if upright and (matrix := frame.side_data.get("DISPLAYMATRIX")) is not None:
                 a, b, c, d = (np.frombuffer(matrix, np.int32)[[0, 1, 3, 4]] / 65536.0).round(2).tolist()
@@ -140,18 +139,17 @@ def displacement(first: np.ndarray, second: np.ndarray) -> float:
             product = np.fft.rfft2((a - a.mean()) * window) * np.conj(np.fft.rfft2((b - b.mean()) * window))
             peak = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), s=window.shape)
             # a parabola through the peak and its neighbours finds parts of a pixel
-            at = np.array(np.unravel_index(peak.argmax(), peak.shape))
-            shift = [_between(peak[:, at[1]], at[0]), _between(peak[at[0]], at[1])]
-            shift = [s - side if s > side / 2 else s for s, side in zip(shift, window.shape, strict=True)]
-            lengths.append(float(np.hypot(shift[0], shift[1])))
+            row, column = map(int, np.unravel_index(peak.argmax(), peak.shape))
+            shift = (_between(peak[:, column], row), _between(peak[row], column))
+            lengths.append(math.hypot(*(s - n * (s > n / 2) for s, n in zip(shift, window.shape, strict=True))))
     return float(np.mean(lengths)) / max(first.shape)
 
 
-def _between(line: np.ndarray, at: int) -> float:
+def _between(line: np.ndarray, i: int) -> float:
     """Locate the peak of a parabola through three values of a periodic line."""
-    low, mid, high = line[at - 1], line[at], line[(at + 1) % len(line)]
+    low, mid, high = line[i - 1], line[i], line[(i + 1) % len(line)]
     curve = low - 2 * mid + high
-    return float(at + (0.5 * (low - high) / curve if curve < 0 else 0.0))
+    return float(i + (0.5 * (low - high) / curve if curve < 0 else 0.0))
 
 
 def _pace(video: Path) -> tuple[float, float, int]:

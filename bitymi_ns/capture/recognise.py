@@ -108,11 +108,13 @@ def _of_file(file: Path) -> Iterator[tuple[Format, Path]]:
 def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
     """Yield a folder's captures in order of preference."""
     yield from _transforms_in(folder)
-    yield from (("colmap", folder / model) for model in models_in(folder))
+    for model in models_in(folder):
+        yield "colmap", folder / model
     yield from _scanned(folder)
     if (photographs := _photographs_in(folder)) is not None:
         yield "photographs", photographs
-    yield from (("video", video) for video in folder_contents.videos_in(folder))
+    for video in folder_contents.videos_in(folder):
+        yield "video", video
 
 
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:

@@ -36,7 +36,7 @@ class RoomView(NamedTuple):
 
     def rays(self, supersample: int = 1) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Compute the origin [3, 1] and unit directions [3, H s W s] of rays through s by s subpixel centres."""
-        focal, w, h = (supersample * value for value in (self.focal, self.width, self.height))
+        focal, w, h = supersample * self.focal, supersample * self.width, supersample * self.height
         d = Pinhole(focal, focal, w / 2, h / 2, w, h).rays * (1, -1, -1) @ self.camera_to_world[:3, :3].T
         d /= np.linalg.norm(d, axis=-1, keepdims=True)
         return self.camera_to_world[:3, 3:].astype(np.float32), np.ascontiguousarray(d.reshape(-1, 3).T, np.float32)

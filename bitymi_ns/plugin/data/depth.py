@@ -162,8 +162,8 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> S
         return None
     if use_relative:
         usable = [fit for fit in relative if fit is not None]
-        kind = "relative and inverse" if any(fit.inverse for fit in usable) else "relative"
-        say(f"Depth of {len(usable)} of {len(seen)} photographs is {kind}: scale and shift are fitted to the points.")
+        how = "relative and inverse" if any(fit.inverse for fit in usable) else "relative"
+        say(f"Depth of {len(usable)} of {len(seen)} photographs is {how}: scale and shift are fitted to the points.")
         return relative
     ratio = scale / unit
     other = "" if abs(ratio - 1.0) < 2 * TOLERANCE else f", times {ratio:.4g} by the points"

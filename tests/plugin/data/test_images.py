@@ -115,7 +115,7 @@ def test_masks_without_a_pixel(capture: Path, capsys: pytest.CaptureFixture[str]
     assert "The masks of 1 of 2 held-out photographs exclude every pixel" in message and "frame_00005.png" in message
     for path in (capture / "masks").iterdir():
         Image.new("L", (48, 36)).save(path)
-    with expect("the masks of all 10 training photographs exclude every pixel.*if the masks are inverted"):
+    with expect("the masks of all 10 training photographs exclude every pixel.*invert inverted masks"):
         load(capture)
     edit(capture, lambda meta: meta["frames"][5].pop("mask_path"))
     with expect("no mask_path for images/frame_00006.png, but other frames have one"):

@@ -149,7 +149,7 @@ def test_without_points_photographs_are_compared(capture, room, capsys, monkeypa
     check(manager, room[1])
     on_surface(manager, room[1])
     load(capture(lambda z, _: 20.0 * z, points=False))
-    assert "its unit may be another" in " ".join(capsys.readouterr().out.split())
+    assert "Its unit may be another" in " ".join(capsys.readouterr().out.split())
     load(capture(points=False), depth="relative")
     assert "Relative depth needs points" in " ".join(capsys.readouterr().out.split())
 

@@ -125,11 +125,11 @@ class Calibration:
 def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict[str, float]:
     """Measure the figures of one scene and seed."""
     config, background = TrainConfig(seed=seed), torch.zeros(3)
-    cameras = [view.camera for view in capture.train]
+    views, cameras = [*capture.train, *capture.held_out], [view.camera for view in capture.train]
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
     train = partial(fit, scene, capture.train, [], config, SETTINGS["steps"], callback=calibration.every(10))
     _, training = calibration.timed(train)
-    trained = evaluate(scene, capture.views, config)
+    trained = evaluate(scene, views, config)
     refine = RefineOptions(tune=TuneOptions.of_learned(SETTINGS["tuning"]), train=config)
     to = (BakeOptions(format="bc7"), refine, calibration.every(10))
     baked, baking = calibration.timed(partial(bake, scene, cameras, capture.train, background, *to))
@@ -139,7 +139,7 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
         size = sum(path.stat().st_size for path in bundle.iterdir())
         drawn = read_bundle(bundle).scene
     quality, distances, units = [], [], []
-    for view in capture.views:
+    for view in views:
         image, unit = calibration.timed(partial(drawn.render, view.camera, background))
         units.append(unit)
         pair = image.rgb.clamp(0.0, 1.0), view.target(background, "cpu")

@@ -227,7 +227,9 @@ def main(options: Options) -> None:
             say(", ".join(f"{name} {figure:.4g}" for name, figure in said.items()))
     cells.refresh()
     records, own = Records(), {identity(run.key(), "cell") for run in runs}
-    add_cells((cell for cell in cells if identity(cell["key"], "cell", "bundle") in own), cells.path, records)
+    add_cells(
+        (cell for cell in cells.known.values() if identity(cell["key"], "cell", "bundle") in own), cells.path, records
+    )
     publish(page("Long and short runs", quality_markdown(over_seeds(records.evaluations))), options.output)
 
 

@@ -137,11 +137,6 @@ class SplitCapture:
     colours: Tensor  # [M, 3] in [0, 1]
     white: bool = False  # evaluate images with alpha over white, as for Blender's captures
 
-    @property
-    def views(self) -> list[View]:
-        """All views."""
-        return [*self.train, *self.held_out]
-
 
 def load_capture(path: Path, downscale: int = 1) -> SplitCapture:
     """Read a capture, translated and scaled as in nerfstudio: the mean of the cameras is the origin, and their largest

@@ -6,7 +6,6 @@ import fcntl
 import json
 import os
 import platform
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,29 +40,23 @@ def provenance(command: list[str], seconds: float) -> dict[str, Any]:
 
 
 class Cells:
-    """Finished cells of a work folder; several processes may append to the file."""
+    """Finished cells of a work folder, `known` by identity; several processes may append to the file."""
 
     def __init__(self, path: Path) -> None:
         """Raises BenchError: a line is not a cell."""
         self.path = path
         self.refresh()
 
-    def __len__(self) -> int:
-        return len(self._known)
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        return iter(self._known.values())
-
     def refresh(self) -> None:
         """Read the file again. A truncated last line (of a killed writer) is skipped."""
-        self._known: dict[str, dict[str, Any]] = {}
+        self.known: dict[str, dict[str, Any]] = {}
         text = read_bytes(self.path) if self.path.is_file() else b""
         for number, line in enumerate(text[: text.rfind(b"\n") + 1].splitlines(), 1):
             if not line.strip():
                 continue
             try:
                 cell = json_of(line)
-                self._known[identity(cell["key"])] = {**cell, "value": dict(cell["value"])}
+                self.known[identity(cell["key"])] = {**cell, "value": dict(cell["value"])}
             except (ValueError, KeyError, TypeError, AttributeError) as error:
                 raise BenchError(
                     f"{self.path}, line {number}, is not a finished cell ({error}): remove that line, or give another "
@@ -72,7 +65,7 @@ class Cells:
 
     def get(self, key: dict[str, Any]) -> dict[str, Any] | None:
         """Return a finished cell, or None."""
-        return self._known.get(identity(key))
+        return self.known.get(identity(key))
 
     def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:
         """Append a cell, after removing a truncated last line; NaN and infinite numbers, which JSON cannot hold, become
@@ -89,4 +82,4 @@ class Cells:
                 file.write(line)
                 file.flush()
                 os.fsync(file.fileno())
-        self._known[identity(key)] = cell
+        self.known[identity(key)] = cell

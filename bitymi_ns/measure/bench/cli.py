@@ -73,7 +73,7 @@ class BenchRun:
         try:
             failures = run_chains(work, runs)
         except KeyboardInterrupt:
-            finished = len(Cells(work / FILE))
+            finished = len(Cells(work / FILE).known)
             kept = f"{finished} finished cells are in {work}" if finished else "no cell was finished"
             say(f"interrupted; {kept}. Run the same command to continue")
             return INTERRUPTED
@@ -87,5 +87,5 @@ class BenchRun:
         tables = quality_markdown(records.evaluations)
         publish(page(f"Benchmark: {self.plan or self.suite}", tables, [NOTES, *failed], commits), self.output)
         kept = f"Cells: {cells.path}. A page of it: bitymi report {cells.path}"
-        print(printable(kept if len(cells) else "No cell was finished."), file=sys.stderr)
+        print(printable(kept if cells.known else "No cell was finished."), file=sys.stderr)
         return FAILED if failures else 0

@@ -21,7 +21,7 @@ CURVE = "training_curve.jsonl"
 def train_command(work: Path, run: Cell) -> list[str]:
     """Build the command line of ns-train, without viewer, with the run's seed for all generators."""
     command = [tool("ns-train"), run.method, "--output-dir", str(work / "runs")]
-    command += ["--experiment-name", run.scene, "--timestamp", run.run_name, "--vis", "none"]
+    command += ["--experiment-name", run.scene, "--timestamp", Path(run.folder).name, "--vis", "none"]
     if run.steps is not None:
         command += ["--max-num-iterations", str(run.steps)]
     seeded = ["machine.seed"]
@@ -87,17 +87,6 @@ def missing(chain: Chain, cells: Cells) -> list[Cell]:
     return pending
 
 
-def lock_of(work: Path, run: Cell) -> Lock:
-    """Lock a run against other processes. Raises CommandFailed: another process holds the lock."""
-    path = work / "locks" / f"{run.folder.replace('/', '--')}.lock"
-    with write_errors_as(work, BenchError, ", with --work"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            return Lock(path, say)
-        except Busy as error:
-            raise CommandFailed(f"{run.run}: {error}") from error
-
-
 def _run_cell(work: Path, cell: Cell, cells: Cells, lock: Lock) -> None:
     command, output = command_of(work, cell), work / cell.output
     if cell.cell == "eval":  # the folder also holds other evaluations
@@ -125,19 +114,24 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
         if not missing(chain, cells):
             continue
         broken: list[Cell] = []
+        path = work / "locks" / f"{chain[0].folder.replace('/', '--')}.lock"
         try:
-            with lock_of(work, chain[0]) as lock:
-                cells.refresh()
-                for cell in missing(chain, cells):
-                    if cell.parent in broken:
-                        broken.append(cell)
-                        continue
-                    say(f"{cell} ({done() + 1} of {total})")
-                    try:
-                        _run_cell(work, cell, cells, lock)
-                    except CommandFailed as error:
-                        broken.append(cell)
-                        failures.append(f"{cell} failed: {error}")
-        except CommandFailed as error:
-            failures.append(str(error))
+            with write_errors_as(work, BenchError, ", with --work"):
+                path.parent.mkdir(parents=True, exist_ok=True)
+                lock = Lock(path, say)
+        except Busy as error:
+            failures.append(f"{chain[0].run}: {error}")
+            continue
+        with lock:
+            cells.refresh()
+            for cell in missing(chain, cells):
+                if cell.parent in broken:
+                    broken.append(cell)
+                    continue
+                say(f"{cell} ({done() + 1} of {total})")
+                try:
+                    _run_cell(work, cell, cells, lock)
+                except CommandFailed as error:
+                    broken.append(cell)
+                    failures.append(f"{cell} failed: {error}")
     return failures

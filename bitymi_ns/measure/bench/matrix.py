@@ -74,16 +74,12 @@ class Cell(Scene):
         return self.method in preset_names()
 
     @property
-    def run_name(self) -> str:
-        """Folder name of the run, unique among those of a method on a capture."""
+    def folder(self) -> str:
+        """Path of the run below runs/, bundles/, evals/ and logs/ of the work folder: its settings, and their hash."""
         digest = hashlib.sha256(identity(self.key, *NOT_OF_A_RUN).encode()).hexdigest()[:8]
         length = "own-length" if self.steps is None else f"{self.steps}-steps"
-        return f"{length}{'' if self.seed is None else f'-seed{self.seed}'}-{digest}"
-
-    @property
-    def folder(self) -> str:
-        """Path of the run below runs/, bundles/, evals/ and logs/ of the work folder."""
-        return f"{self.scene}/{self.method}/{self.run_name}"
+        seed = "" if self.seed is None else f"-seed{self.seed}"
+        return f"{self.scene}/{self.method}/{length}{seed}-{digest}"
 
     @property
     def form(self) -> str:

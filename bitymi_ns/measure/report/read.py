@@ -132,7 +132,7 @@ def _read(path: Path) -> Records:
     found = Records()
     with reading(path, _refuse, ADVICE, passing=(ReportError,)):
         if path.name == CELLS:
-            add_cells(Cells(path), path, found)
+            add_cells(Cells(path).known.values(), path, found)
         elif is_evaluation(data := read_json(path, MAX_BYTES)):
             found.evaluations.append(evaluation_from(data, path))
     return found

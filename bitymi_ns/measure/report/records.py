@@ -80,19 +80,23 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
 
 def link(records: Records) -> None:
     """Link records: make labels unique, and add to evaluations of files the training times of the only curve of their
-    scene and method, and to bundles the difference from their trained scene (`psnr_delta`)."""
+    scene and method, and to bundles the difference from their trained scene (`psnr_delta`): the only one of the same
+    scene and method, or of these the only one in the same folder."""
     disambiguate(records.evaluations)
     disambiguate(records.curves)
+    of_files = [row for row in records.evaluations if not row.series]  # those of a benchmark state both
     for i, row in enumerate(records.evaluations):
-        if row.series:  # of a benchmark, which states both
+        if row.series:
             continue
         known: dict[str, float | None] = {}
         curves = [c for c in records.curves if (c.scene, c.label) == (row.scene, row.method)]
         if len(curves) == 1:
             known = {f"train_{key}": curves[0].last(key) for key in ("seconds", "cpu_seconds")}
-        parent = trained_parent(row, records.evaluations)
-        if parent is not None and "psnr" in row.results and "psnr" in parent.results:
-            known["psnr_delta"] = row.results["psnr"] - parent.results["psnr"]
+        trained = [e for e in of_files if not e.baked and (e.scene, e.method) == (row.scene, row.method)]
+        if len(trained) > 1:
+            trained = [e for e in trained if e.source.parent == row.source.parent]
+        if row.baked and len(trained) == 1 and "psnr" in row.results and "psnr" in trained[0].results:
+            known["psnr_delta"] = row.results["psnr"] - trained[0].results["psnr"]
         records.evaluations[i] = replace(row, results=finite_numbers(known) | row.results)
 
 
@@ -121,15 +125,6 @@ def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
         results = means([row.results for row in rows]) | {"psnr_seeds": spread}
         merged.append(replace(rows[0], label=f"{rows[0].group} ({len(rows)} seeds)", results=results))
     return merged
-
-
-def trained_parent(row: Evaluation, evaluations: list[Evaluation]) -> Evaluation | None:
-    """Find the evaluation of a bundle's trained scene: of the same scene and method; if there are several, the one
-    whose file is in the same folder. None if ambiguous."""
-    same = [e for e in evaluations if not (e.baked or e.series) and (e.scene, e.method) == (row.scene, row.method)]
-    if len(same) > 1:
-        same = [e for e in same if e.source.parent == row.source.parent]
-    return same[0] if row.baked and len(same) == 1 else None
 
 
 def disambiguate(items: list) -> None:

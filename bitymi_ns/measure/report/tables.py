@@ -9,6 +9,7 @@ from bitymi_ns.measure.markdown import escaped
 from bitymi_ns.measure.report.records import Evaluation, grouped, means
 
 MISSING = "–"
+ARROWS = {"up": " ↑", "down": " ↓", None: ""}  # to the better direction, as in the paper
 
 
 class Row(NamedTuple):
@@ -34,11 +35,6 @@ class Column(NamedTuple):
     key: str
     text: Callable[[float], str]
     better: Literal["up", "down"] | None = None
-
-    @property
-    def heading(self) -> str:
-        """Title with an arrow for the better direction, as in the paper."""
-        return self.title + {"up": " ↑", "down": " ↓", None: ""}[self.better]
 
     def value(self, row: Evaluation) -> float | None:
         """Return the figure of an evaluation if it has one that applies: of the training for trained scenes, of an
@@ -120,32 +116,26 @@ def scene_table(title: str, evaluations: list[Evaluation], columns: Sequence[Col
                 row.best.add(j)
     parts = grouped(zip(ordered, rows, strict=True), lambda pair: pair[0].baked)
     sections = [[Row([STAGES[baked]], set()), *(row for _, row in pairs)] for baked, pairs in parts.items()]
-    return Table(title, ["Method", *(column.heading for column in figures)], sum(sections, []), note)
-
-
-def over_scenes(evaluations: list[Evaluation]) -> tuple[list[Evaluation], list[str]]:
-    """Average over scenes; returns the means and the scenes' names, of which one alone is not averaged.
-
-    Only labels evaluated on the largest set of scenes are included: means over different scenes are not comparable.
-    """
-    groups = grouped(evaluations, lambda row: (row.baked, row.label))
-    covers = {key: {row.scene for row in rows} for key, rows in groups.items()}
-    widest = max(covers.values(), key=len, default=set())
-    kept = [rows for key, rows in groups.items() if covers[key] == widest]
-    return [replace(rows[0], results=means([row.results for row in rows])) for rows in kept], sorted(widest)
+    return Table(
+        title, ["Method", *(column.title + ARROWS[column.better] for column in figures)], sum(sections, []), note
+    )
 
 
 def quality_tables(evaluations: list[Evaluation]) -> list[Table]:
-    """Build one table per scene and one of means over scenes, of each of the KINDS."""
+    """Build one table per scene and one of means over scenes, of each of the KINDS. The means are those of the labels
+    evaluated on the largest set of scenes: means over different scenes are not comparable."""
     tables = []
     for kind, columns in KINDS.items():
         rows = [row for row in evaluations if any(column.value(row) is not None for column in columns)]
         for scene, of_scene in sorted(grouped(rows, lambda row: row.scene).items()):
             tables.append(scene_table(scene + kind, of_scene, columns))
-        averaged, scenes = over_scenes(rows)
-        if len(scenes) > 1:
-            note = f"Scenes: {', '.join(scenes)}."
-            tables.append(scene_table(f"Mean of {len(scenes)} scenes{kind}", averaged, columns, note))
+        labels = list(grouped(rows, lambda row: (row.baked, row.label)).values())
+        widest = max(({row.scene for row in of_label} for of_label in labels), key=len, default=set())
+        if len(widest) > 1:
+            comparable = [of_label for of_label in labels if {row.scene for row in of_label} == widest]
+            averaged = [replace(same[0], results=means([row.results for row in same])) for same in comparable]
+            note = f"Scenes: {', '.join(sorted(widest))}."
+            tables.append(scene_table(f"Mean of {len(widest)} scenes{kind}", averaged, columns, note))
     return tables
 
 

@@ -131,8 +131,13 @@ def measure(
     worst = max(gradient_errors, key=lambda key: gradient_errors[key])
     input_forward = input_gradient = 0.0
     generator = torch.Generator().manual_seed(0)
+
+    def probe(values: Tensor) -> Tensor:
+        signs = torch.randint(0, 2, values.shape, generator=generator).double() * 2 - 1
+        return values * (1 + ROUNDING[dtype] * signs)
+
     for _ in range(PROBES):
-        moved = _map(rounded, lambda t: t * (1 + ROUNDING[dtype] * _signs(t, generator)))
+        moved = _map(rounded, probe)
         other = _by_reference(moved, near, way)
         agree = _same(other, want)
         input_forward = max(input_forward, _image_error(other.images, want.images, agree))
@@ -153,10 +158,6 @@ def measure(
 def _map(case: SceneCase, function) -> SceneCase:
     params = {key: function(value) for key, value in case.params.items()}
     return replace(case, params=params, viewmat=function(case.viewmat), K=function(case.K))
-
-
-def _signs(like: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.randint(0, 2, like.shape, generator=generator).double() * 2 - 1
 
 
 def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, way: Way) -> _Result:

@@ -5,15 +5,12 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
-from bitymi_ns.bundle import World
-from bitymi_ns.bundle.manifest import describe, dump
-from bitymi_ns.codec.quantise import Format
 from bitymi_ns.measure.bench.matrix import Chain, Row, Scene, chains
 
+BUNDLE = Path(__file__).resolve().parents[2] / "e2e/stored/bundle/bundle.json"
 FAKE = """#!{python} -SE
 import json, os, pathlib, sys, time
 
@@ -42,41 +39,16 @@ if name == "ns-train":
 elif name == "ns-export":
     bundle = pathlib.Path(given("--output-dir"))
     bundle.mkdir(parents=True)
-    (bundle / "bundle.json").write_text({manifests!r}[given("--format")])
+    (bundle / "bundle.json").write_text(pathlib.Path({bundle!r}).read_text())
     (bundle / "config.yml").write_text("config")
 elif name == "ns-eval":
     assert pathlib.Path(given("--load-config")).is_file()
     baked = "/bundles/" in given("--load-config")
     results = dict(psnr=21.0 - 0.01 * baked, ssim=0.8, flip=0.1, lpips=float("nan"), surfels=120.0,
                    render_ms=9.0 - 5 * baked, fragments_per_pixel=8.0)
-    if baked:
-        results["atlas_bytes"] = 5000.0
     pathlib.Path(given("--output-path")).write_text(json.dumps(dict(results=results)))
     pathlib.Path(given("--render-output-path")).mkdir(exist_ok=True)
 """
-
-
-def manifest(format: str) -> str:
-    """Write the bundle.json of a scene of 100 surfels."""
-    files = {name: {"bytes": size, "sha256": "0" * 64} for name, size in (("surfels.ply", 1000), ("atlas.ktx2", 5000))}
-    info = {
-        "version": "6.0",
-        "surfels": {"count": 100, "view_color": "sv", "sites": 7},
-        "atlas": {"format": format, "width": 64, "height": 64, "layers": 1, "offset": 0.0, "scale": 1.0},
-        "render": {"near": 0.2, "weight_bound": 0.02, "background": [0.0, 0.0, 0.0]},
-        "world": World().described(),
-        "bounds": {"min": [0.0] * 3, "max": [1.0] * 3},
-        "statistics": {
-            "surfels": {"kept": 100},
-            "texels": {"nyquist": 9999, "after_cap_by_views": 1600},
-            "held_out": {"psnr_baked_against_neural": 50.0},
-        },
-        "files": files,
-    }
-    return dump(describe(info)).decode()
-
-
-TOOLS = ("ns-train", "ns-export", "ns-eval")
 
 
 class Fakes:
@@ -84,13 +56,12 @@ class Fakes:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.log, self.plan, self.slow = folder / "log", folder / "fail", folder / "slow"
-        for file in (self.log, self.plan, self.slow):
+        self.log, self.plan, self.slow = files = [folder / name for name in ("log", "fail", "slow")]
+        for file in files:
             file.write_text("")
-        paths = {"log": str(self.log), "plan": str(self.plan), "slow": str(self.slow)}
-        text = FAKE.format(python=sys.executable, manifests={f: manifest(f) for f in get_args(Format)}, **paths)
-        for name in TOOLS:
-            (folder / name).write_text(text)
+        paths = {"log": str(self.log), "plan": str(self.plan), "slow": str(self.slow), "bundle": str(BUNDLE)}
+        for name in ("ns-train", "ns-export", "ns-eval"):
+            (folder / name).write_text(FAKE.format(python=sys.executable, **paths))
             (folder / name).chmod(0o755)
 
     def calls(self) -> list[str]:
@@ -119,9 +90,8 @@ class Fakes:
 def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
     folder = tmp_path / "bin"
     folder.mkdir()
-    found = Fakes(folder)
     monkeypatch.setattr("bitymi_ns.measure.bench.engine.tool", lambda name: str(folder / name))
-    return found
+    return Fakes(folder)
 
 
 @pytest.fixture

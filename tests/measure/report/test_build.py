@@ -83,13 +83,6 @@ def test_plots_of_one_or_two_points_are_left_out(eval_json, tmp_path: Path, coun
     assert len(pictures(page)) == drawn and "20.00" in page
 
 
-def test_numbers_that_are_all_missing(tmp_path: Path) -> None:
-    path, curve = tmp_path / "eval.json", tmp_path / "curve.jsonl"
-    path.write_text('{"experiment_name": "fox", "method_name": "bitymi", "results": {"psnr": NaN, "render_ms": 0}}')
-    curve.write_text('{"step": 1, "psnr": null}\n')
-    assert "1 evaluation, 1 training run" in build([path, curve], tmp_path / "report").read_text("utf8")
-
-
 def test_a_later_report_replaces_an_earlier_one_and_nothing_else(eval_json, tmp_path: Path) -> None:
     for name, psnr in (("a.json", 20.0), ("b.json", 21.0)):
         eval_json(name, psnr=psnr)
@@ -126,6 +119,10 @@ def test_nothing_usable(tmp_path: Path) -> None:
     for inputs in ([tmp_path / "in"], []):
         with pytest.raises(ReportError, match="nothing to report in .*ns-eval"):
             build(inputs, tmp_path / "report")
+    path, curve = tmp_path / "eval.json", tmp_path / "curve.jsonl"
+    path.write_text('{"experiment_name": "fox", "method_name": "bitymi", "results": {"psnr": NaN, "render_ms": 0}}')
+    curve.write_text('{"step": 1, "psnr": null}\n')
+    assert "1 evaluation, 1 training run" in build([path, curve], tmp_path / "report").read_text("utf8")
 
 
 def test_foreign_page_is_not_replaced(eval_json, tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.measure.report.read import collect, read_jsonl
-from bitymi_ns.measure.report.records import ReportError, evaluation_from, over_seeds, trained_parent
+from bitymi_ns.measure.report.records import Records, ReportError, evaluation_from, link, over_seeds
 from tests.measure.report.conftest import cell, figures, write_lines
 
 
@@ -24,23 +24,19 @@ def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
     assert row.scene == tmp_path.name and row.method == "unnamed method"
 
 
-@pytest.mark.parametrize(
-    ("results", "baked"),
-    [({}, False), ({"atlas_bytes": 0}, False), ({"bundle_bytes": 9}, True)],
-)
 @pytest.mark.parametrize("method", ["bitymi", "half-baked", "bundle"])
-def test_a_bundle_states_its_bytes_and_a_run_has_none(method: str, results: dict[str, float], baked: bool) -> None:
-    assert make(method=method, psnr=20.0, **results).baked is baked
+def test_a_bundle_states_its_bytes_and_a_run_has_none(method: str) -> None:
+    rows = [make(method=method, psnr=20.0, **results) for results in ({}, {"atlas_bytes": 0}, {"bundle_bytes": 9})]
+    assert [row.baked for row in rows] == [False, False, True]
 
 
-def test_trained_parent_is_of_the_same_folder_when_there_are_several():
-    first, second = make(source="run1/trained.json", psnr=20.0), make(source="run2/trained.json", psnr=21.0)
-    baked = make(source="run2/baked.json", bundle_bytes=1, psnr=20.9)
-    assert trained_parent(baked, [first, second, baked]) is second
-    elsewhere = make(source="run3/baked.json", bundle_bytes=1)
-    assert trained_parent(elsewhere, [first, second]) is None
-    assert trained_parent(first, [first, second]) is None
-    assert trained_parent(make(scene="lego", source="run1/x.json", bundle_bytes=1), [first, second]) is None
+def test_a_bundle_is_compared_with_the_trained_scene_of_its_folder_when_there_are_several():
+    rows = [make(source=f"run{i}/trained.json", psnr=20.0 + i) for i in (1, 2)]
+    for scene, folder in (("fox", "run2"), ("fox", "run3"), ("lego", "run1")):
+        rows.append(make(scene=scene, source=f"{folder}/baked.json", bundle_bytes=1, psnr=21.9))
+    link(records := Records(rows))
+    deltas = [row.results.get("psnr_delta") for row in records.evaluations]
+    assert deltas == [None, None, pytest.approx(-0.1), None, None]
 
 
 def test_curve_keeps_the_last_line_of_a_repeated_step_and_leaves_out_a_cut_last_line(tmp_path: Path):
@@ -85,23 +81,13 @@ def test_namesakes_get_different_labels(eval_json, tmp_path: Path):
     assert sorted(labels) == ["bitymi (seed0/eval)", "bitymi (seed1/eval)"]
 
 
-def test_file_named_twice_is_read_once(eval_json, tmp_path: Path):
-    path = eval_json(psnr=20.0)
-    assert len(collect([path, path, path.parent], tmp_path / "report").evaluations) == 1
-
-
-def test_search_leaves_out_hidden_folders_and_the_report(eval_json, tmp_path: Path):
+def test_search_reads_a_file_once_and_leaves_out_hidden_folders_and_the_report(eval_json, tmp_path: Path):
     for name in (".hidden/e.json", "report/e.json"):
         eval_json(name, psnr=1.0)
-    eval_json("kept/e.json", psnr=2.0)
-    records = collect([tmp_path], tmp_path / "report")
+    path = eval_json("kept/e.json", psnr=2.0)
+    (tmp_path / "kept" / "again").symlink_to(tmp_path / "kept")
+    records = collect([path, path, tmp_path], tmp_path / "report")
     assert [e.results["psnr"] for e in records.evaluations] == [2.0]
-
-
-def test_link_that_leads_back_does_not_loop(eval_json, tmp_path: Path):
-    eval_json("in/e.json", psnr=2.0)
-    (tmp_path / "in" / "again").symlink_to(tmp_path / "in")
-    assert len(collect([tmp_path / "in"], tmp_path / "report").evaluations) == 1
 
 
 # cells of a benchmark
@@ -121,14 +107,9 @@ def test_a_work_folder_is_read_by_its_cells_alone(work: Path, tmp_path: Path) ->
     assert trained.label == "bitymi (2 seeds)" and trained.results["psnr"] == pytest.approx(25.1)
     assert baked.results["psnr_seeds"] == pytest.approx(0.1414, abs=1e-3)
     assert baked.label == "bitymi, bc7 (2 seeds)"
-
-
-def test_a_bundle_of_one_seed_is_compared_with_that_seed(work: Path, tmp_path: Path) -> None:
-    rows = collect([work], tmp_path / "report").evaluations
-    only = [row for row in rows if not row.baked or row.label.endswith("seed 0")]
-    merged = over_seeds(only)
-    assert len(only) == 3 and [row.baked for row in merged] == [False, True]
-    assert merged[1].results["psnr_delta"] == pytest.approx(-0.1)
+    only = over_seeds([row for row in records.evaluations if not row.baked or row.label.endswith("seed 0")])
+    assert [row.baked for row in only] == [False, True]
+    assert only[1].results["psnr_delta"] == pytest.approx(-0.1)  # from its own seed
 
 
 def test_of_equal_keys_the_last_line_counts(tmp_path: Path) -> None:
@@ -147,13 +128,12 @@ def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("{}", r"line 2, is not a finished cell"),
-        ('{"key": {"cell": "eval"}, "value": {}}', r"the eval cell of .* the entry 'results' is missing"),
+        ("{}", "line 2, is not a finished cell"),
+        ('{"key": {"cell": "eval"}, "value": {}}', "the eval cell of .* the entry 'results' is missing"),
         (
             '{"key": {"cell": "eval", "scene": ["a"]}, "made": "x", "value": {"results": {"psnr": "bad"}}}',
-            r"the entry 'psnr' is missing",
+            "the entry 'psnr' is missing",
         ),
-        ("nonsense", r"line 2, is not a finished cell"),
     ],
 )
 def test_malformed_lines_are_named(tmp_path: Path, line: str, reason: str) -> None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from bitymi_ns.measure.report.records import Records, evaluation_from, link
 from bitymi_ns.measure.report.tables import COLUMNS, FITTED, Row, Table, quality_tables, to_markdown
-from tests.measure.report.pages import page_of
+from tests.measure.report.conftest import page_of
 from tests.view.browser import drive, plain_server
 
 

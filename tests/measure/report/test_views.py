@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.measure.report.pictures import compare_views
-from tests.measure.report.pages import page_of
+from tests.measure.report.conftest import page_of
 
 
 def write(folder: Path, name: str, errors: list[float], tint: float = 0.0) -> list[Path]:

@@ -66,12 +66,12 @@ def background_points(points: Tensor, views: Sequence[View], seed: int) -> Backg
         return BackgroundPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0))
     medians = medians.nan_to_num(float(medians.nanmedian()))
     typical_count = float(counts.median())
-    grids = [_Grid.of(camera, *each, count=typical_count) for camera, each in zip(cameras, seen, strict=True)]
-    found = [
+    grids = [_Grid.of(camera, *shown, count=typical_count) for camera, shown in zip(cameras, seen, strict=True)]
+    candidates = [
         _points_behind(view, camera, grid, float(median), generator)
         for view, camera, grid, median in zip(chosen, cameras, grids, medians, strict=True)
     ]
-    joined = BackgroundPoints(*map(torch.cat, zip(*found, strict=True)))
+    joined = BackgroundPoints(*map(torch.cat, zip(*candidates, strict=True)))
     empty, before = torch.zeros(2, len(joined.xyz))
     for camera, grid in zip(cameras, grids, strict=True):
         x, y, z, inside = camera.project(joined.xyz)

@@ -49,7 +49,7 @@ def evaluate(
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)
-    values, fitted, along, refined, uncorrected, fragments = [], [], [], [], [], []
+    values, fitted, along, refined, uncorrected, fragments = ([] for _ in range(6))
     corrections = None if exposure is None or exposure.table is None else exposure
     for view in (view.to(device) for view in views):
         if corrections is not None:
@@ -68,5 +68,5 @@ def evaluate(
             view = view._replace(camera=aligned(scene, view, background, config.loss.ssim_weight))
             refined.append(view_psnr(scene, view, background))
     mean_fragments = sum(fragments) / len(fragments) if fragments else math.nan
-    means = (mean_psnr(each) for each in (fitted, along, refined, uncorrected))
+    means = map(mean_psnr, (fitted, along, refined, uncorrected))
     return Quality(mean_psnr(values), mean_fragments, *means)

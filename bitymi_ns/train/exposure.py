@@ -246,9 +246,8 @@ def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] 
 def corrected(
     views: Sequence[View], state: Mapping[str, Any] | None, files: Sequence[Path] | None = None
 ) -> Sequence[View]:
-    """Add the final corrections of a run to its training views. `views`: the run's training views at full size. `state`
-    and `files`: state and files of its `Exposure`; state None: no corrections. Raises ValueError: the number of
-    photographs differs from the run's."""
+    """Add the final corrections of a run to its training views at full size. `state` and `files`: of its `Exposure`.
+    Raises ValueError: the number of photographs differs from the run's."""
     if state is None or state["table"] is None:
         return views
     exposure = restored(state, len(views), files)
@@ -287,8 +286,8 @@ def _diagonal(table: Tensor) -> slice:
 
 
 def exif_gains(stops: Sequence[float] | None, count: int) -> Tensor:
-    """Compute initial log gains [V, 3] from EXIF exposures, for gamma-encoded colours; 0 if unknown. `stops`:
-    `exif_stops` of each photograph, NaN: unknown; None: unknown for all. `count`: number of photographs."""
+    """Compute initial log gains [V, 3] of `count` photographs from their EXIF exposures (`exif_stops`), for
+    gamma-encoded colours; 0 if unknown."""
     if stops is None:
         return torch.zeros(count, 3)
     light = torch.tensor(stops, dtype=torch.float64) * math.log(2.0)

@@ -17,7 +17,7 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.optimizers import forget_gradients, make_optimizers, step
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import TrainingData, View, covered_share, training_order
+from bitymi_ns.train.views import TrainingData, View, covered_fraction, training_order
 
 if TYPE_CHECKING:
     from bitymi_ns.ops.training_view import ComparedView
@@ -77,7 +77,7 @@ class Trainer:
         self.optimizers = make_optimizers(scene)
         pixels = sum(camera.width * camera.height for camera in cameras)
         named = None if None in files else files
-        data = TrainingData(views, extent, pixels, len(scene), covered_share(views), files=named, cameras=cameras)
+        data = TrainingData(views, cameras, extent, pixels, len(scene), covered_fraction(views), files=named)
         self.training = Training(scene, data, self.optimizers, config, max_steps, processes=processes)
         self.step = 0
         self._views = len(views)

@@ -17,7 +17,7 @@ Steps = npt.NDArray[np.float64]
 
 GROWTH = 1.19  # factor of the number of surfels per densification, as measured on the captures of docs/training.md
 SURFELS_PER_PIXEL = 0.4  # surfels per pixel of a view at which they hardly grow any more
-KEPT = 0.7  # share of the surfels that the error prune leaves
+KEPT = 0.7  # part of the surfels that the error prune leaves
 SURFEL = 1.5  # cost of a surfel in a step, relative to that of a pixel
 TEXELS = 1.5  # cost of a step with texels, relative to one without
 DRAWN = 0.5  # cost of a view that is drawn only, relative to a step
@@ -27,22 +27,17 @@ RECENT = 100  # steps over which times are averaged, the last one counting most
 
 
 def expected_surfels(schedule: Schedule, first: int, pixels: float, most: int = 0) -> Steps:
-    """Estimate the number of surfels in each step of a run.
-
-    Args:
-        first: number of surfels at the start.
-        pixels: of a view at full size.
-        most: number at which densification stops; 0: no limit.
-    """
+    """Estimate the number of surfels in each step of a run that starts with `first`. `pixels`: of a view at full size.
+    `most`: number at which densification stops; 0: no limit."""
     given = schedule.config.densify.max_surfels
     limit = given or max(first, min(most or np.inf, SURFELS_PER_PIXEL * pixels))
     factors = np.ones(schedule.max_steps)
     growth = (limit / max(1, first)) ** (1 / max(1, len(schedule.densify_steps))) if given else GROWTH
     factors[list(schedule.densify_steps)] = growth
-    found = np.minimum(first * factors.cumprod(), limit)
+    surfels = np.minimum(first * factors.cumprod(), limit)
     for step in schedule.error_prune_steps:
-        found[step:] *= KEPT
-    return found
+        surfels[step:] *= KEPT
+    return surfels
 
 
 class Forecast:

@@ -22,7 +22,7 @@ SWEEPS = 10  # passes of the median polish
 DARKEST, BRIGHTEST = 0.03, 0.97  # range of channel values used: beyond, noise, rounding and clipping dominate
 FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
 CELL = 2.0  # side of the cells of the occlusion test, in mean spacings of the projected points
-HIDDEN = 0.05  # an occluding point is nearer by this share of its depth, or of twice the view's depth range if less
+HIDDEN = 0.05  # an occluding point is nearer by this part of its depth, or of twice the view's depth range if less
 FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
 
@@ -31,8 +31,8 @@ class ExposureGains(NamedTuple):
 
     log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
     points: Tensor  # [V] int64, number of points used for each photograph
-    # share by which gains from half of the points reduce the median deviation of log colours from their point's median,
-    # measured on the other half; NaN: too few points, or no deviation
+    # fraction by which gains from half of the points reduce the median deviation of log colours from their point's
+    # median, measured on the other half; NaN: too few points, or no deviation
     explained: float
 
 
@@ -84,11 +84,11 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
 
 def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
     """Read the pixels [P, ...] of an image [H, W, ...] at P positions of a camera, whose image size may differ."""
-    at = (
-        (along.nan_to_num(0.0) * size / full).long().clamp(0, size - 1).to(image.device)
-        for along, size, full in zip((y, x), image.shape[:2], (camera.height, camera.width), strict=True)
+    row, column = (
+        (position.nan_to_num(0.0) * size / full).long().clamp(0, size - 1).to(image.device)
+        for position, size, full in zip((y, x), image.shape[:2], (camera.height, camera.width), strict=True)
     )
-    return image[tuple(at)]
+    return image[row, column]
 
 
 def _log_gains(logs: Tensor) -> Tensor:

@@ -20,10 +20,10 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import View
 
 MAX_SCALE = 0.25
-"""Largest initial scale, as a share of the larger of scene extent and distance to the nearest camera."""
+"""Largest initial scale, as a fraction of the larger of scene extent and distance to the nearest camera."""
 PIXELS_PER_FIRST_SURFEL = 1000  # minimum number of pixels rendered in a run per initial surfel
 FEWEST_FIRST = 5000  # lower bound of the limit on initial surfels, in runs of any length
-MIN_SCALE = 1e-6  # smallest initial scale, as a share of the scene extent
+MIN_SCALE = 1e-6  # smallest initial scale, as a fraction of the scene extent
 
 
 @dataclass
@@ -46,24 +46,24 @@ def limit_first_surfels(config: TrainConfig, steps: int, pixels: int, views: int
     return replace(config, first_surfels=max(FEWEST_FIRST, int(steps * pixels / views / PIXELS_PER_FIRST_SURFEL)))
 
 
+def _finite(positions: Tensor, dtype: torch.dtype) -> Tensor:
+    """Keep the finite rows of positions [M, 3], on the CPU."""
+    positions = positions.detach().reshape(-1, 3).to("cpu", dtype)
+    return positions[positions.isfinite().all(-1)]
+
+
 def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
     """Compute 1.1 times the largest distance of the training cameras from their mean, in world units. `camera_centers`:
     [C, 3]. `points`: [M, 3]. If all cameras are at one position, the extent is the median distance of the finite points
     from it, and 1 without points."""
-    centers = camera_centers.detach().reshape(-1, 3).double().cpu()
-    centers = centers[centers.isfinite().all(-1)]
+    centers = _finite(camera_centers, torch.float64)
     middle = centers.mean(0) if len(centers) else torch.zeros(3, dtype=torch.float64)
     reach = float((centers - middle).norm(dim=-1).max()) if len(centers) else 0.0
     if reach > 1e-6 * max(1.0, float(middle.norm())):
         return 1.1 * reach
-    if points is not None:
-        points = points.detach().reshape(-1, 3).double().cpu()
-        points = points[points.isfinite().all(-1)]
-        if len(points):
-            median = float((points - middle).norm(dim=-1).median())
-            if median > 0.0:
-                return median
-    return 1.0
+    points = centers[:0] if points is None else _finite(points, torch.float64)
+    median = float((points - middle).norm(dim=-1).median()) if len(points) else 0.0
+    return median if median > 0.0 else 1.0
 
 
 def surfels_from_points(
@@ -87,8 +87,6 @@ def surfels_from_points(
         xyz: [M, 3] world positions; M may be 0.
         rgb: [M, 3] colours in [0, 1]; non-finite values become grey.
         camera_centers: [C, 3] world positions of the training cameras; without cameras, orientations are random.
-        config: training options (opacity, seed, limits).
-        scene_config: kind of the view-dependent colour.
         box: [2, 3] lower and upper corner for random surfels; default: the cube of the scene extent about the cameras.
         background: points in parts of the photographs that no point of `xyz` projects to.
 
@@ -99,8 +97,7 @@ def surfels_from_points(
         ValueError: `xyz` and `rgb` differ in length.
     """
     generator = torch.Generator().manual_seed(config.seed)
-    centers = camera_centers.detach().reshape(-1, 3).float().cpu()
-    centers = centers[centers.isfinite().all(-1)]
+    centers = _finite(camera_centers, torch.float32)
     xyz = xyz.detach().reshape(-1, 3).float().cpu()
     rgb = rgb.detach().reshape(-1, 3).float().cpu()
     if len(xyz) != len(rgb):
@@ -141,10 +138,8 @@ def surfels_from_points(
 
 
 def neighbour_distance(xyz: Tensor, extent: float) -> Tensor:
-    """Compute the root mean square distance [M] of each point to its 3 nearest neighbours, or fewer if there are fewer.
-
-    A single point gets a hundredth of the extent.
-    """
+    """Compute the root mean square distance [M] of each point to its 3 nearest neighbours, or fewer if there are fewer;
+    a hundredth of the extent for a single point."""
     from scipy.spatial import cKDTree  # slow to import
 
     k = min(3, len(xyz) - 1)
@@ -228,7 +223,7 @@ def tangents(quats: Tensor) -> Tensor:
 
 def build_scene(
     points: Tensor,
-    colours: Tensor,
+    colors: Tensor,
     camera_centers: Tensor,
     scene_config: SceneConfig,
     train_config: TrainConfig,
@@ -238,28 +233,21 @@ def build_scene(
     declared: Tensor | None = None,
     background: BackgroundPoints | None = None,
 ) -> tuple[Scene, PointReport]:
-    """Build the initial scene: surfels at the points, or at random in the box, and an untrained texture field.
+    """Build the initial scene on the CPU: surfels at the points, or at random in the box, and an untrained field.
 
     Args:
-        points: [M, 3] world positions; M may be 0.
-        colours: [M, 3] in [0, 1].
-        camera_centers: [C, 3] world positions of the training cameras.
+        points, colors, camera_centers, box, background: as in `surfels_from_points`.
         bounded: the scene has no background (images with alpha): contraction "auto" is then off, as with a small
             `declared` box.
         image_pixels: total over all training images; default for the size of the hash table.
-        box: [2, 3] corners for random surfels; default: the cube of the scene extent about the cameras.
         declared: [2, 3] corners of the scene box that the capture states, if any.
-        background: further points, in parts of the photographs without any.
-
-    Returns:
-        The scene on the CPU, and the counts of points.
 
     Raises:
         ValueError: an option is out of range.
     """
     check_ranges(scene_config)
     check_ranges(train_config)
-    surfels, report = surfels_from_points(points, colours, camera_centers, train_config, scene_config, box, background)
+    surfels, report = surfels_from_points(points, colors, camera_centers, train_config, scene_config, box, background)
     means = surfels["means"][: len(surfels["means"]) - report.background]  # background would make the field coarse
     near = NEAR * scene_extent(camera_centers, means)
     if scene_config.texture != "hash":  # texels are added once the geometry has settled
@@ -285,17 +273,8 @@ def scene_for_views(
     train_config: TrainConfig,
     steps: int | None = None,
 ) -> Scene:
-    """Build the initial scene for photographs in memory, see `build_scene`.
-
-    Args:
-        views: training photographs at full size.
-        points: [M, 3] world positions; M may be 0.
-        colors: [M, 3] in [0, 1].
-        steps: length of the run, which limits the number of points; None: no limit.
-
-    Raises:
-        ValueError: an option is out of range.
-    """
+    """Build the initial scene for photographs in memory, at full size, and points, see `build_scene`. `steps`: length
+    of the run, which limits the number of points; None: no limit."""
     centers = torch.stack([view.camera.center.cpu() for view in views]) if views else torch.zeros(0, 3)
     pixels = sum(view.camera.width * view.camera.height for view in views)
     bounded = any(view.image.shape[-1] == 4 for view in views)
@@ -307,11 +286,8 @@ def scene_for_views(
 
 
 def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:
-    """Compute centre and half size of the field's domain, world units.
-
-    With contraction: the ball around all cameras (`scene_extent`). Without: a cube around `means` (the initial surfels,
-    or the corners of the capture's box), a tenth larger.
-    """
+    """Compute centre and half size of the field's domain, world units: with contraction of the ball around all cameras
+    (`scene_extent`), without of a cube around `means` (initial surfels, or corners of a box), a tenth larger."""
     if contract and len(camera_centers):
         x, y, z = camera_centers.detach().float().cpu().mean(0).tolist()
         return (x, y, z), scene_extent(camera_centers, means)
@@ -321,10 +297,8 @@ def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple
 
 
 def default_table_size(image_pixels: int) -> int:
-    """Choose log2 of the entries per hash level by the photographs, at most 17 so that the table fits into a cache.
-
-    Four levels of 2^17 entries are 8 MB in float32.
-    """
+    """Choose log2 of the entries per hash level by the photographs, at most 17 so that the table fits into a cache:
+    four levels of 2^17 entries are 8 MB in float32."""
     return min(17, max(14, table_size_of(image_pixels)))
 
 

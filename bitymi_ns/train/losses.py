@@ -14,7 +14,7 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.training_view import ComparedView, PhotographTarget
+from bitymi_ns.ops.training_view import ComparedView
 from bitymi_ns.train.config import LossConfig
 
 if TYPE_CHECKING:
@@ -64,13 +64,6 @@ def objective(
         weight = config.normal_weight * config.geometry_interval
         terms["normal"] = weight * normal_error(output.normal, output.alpha, normal, mask)
     return terms
-
-
-def photograph_target(
-    target: Tensor, config: LossConfig, mask: Tensor | None, background: Tensor | None = None
-) -> PhotographTarget:
-    """Make the argument of `Scene.compare`."""
-    return PhotographTarget(target, mask, background, config.ssim_weight, config.falloff_weight, config.falloff_gamma)
 
 
 def fused_losses(config: LossConfig, image: Tensor) -> bool:

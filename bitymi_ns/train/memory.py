@@ -9,9 +9,9 @@ from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops.capacity import free_memory
 from bitymi_ns.train.processes import Processes
 
-SHARE = 0.75
-"""Share of the memory beyond which nothing grows. Copies while surfels are replaced, freed blocks that are kept for the
-next view, and other programs have the rest."""
+FILLED = 0.75
+"""Fraction of the memory beyond which nothing grows. Copies while surfels are replaced, freed blocks that are kept for
+the next view, and other programs have the rest."""
 PER_SURFEL = 3000  # bytes: parameters, gradients, Adam's averages, two states to go back to, copies of a densification
 PER_TEXEL = 44  # bytes: colour, alpha and its gradient, share, and two states with colours in half precision
 PER_TEXEL_SUM = 12  # bytes more on a GPU: the gradient of colours, which the CPU adds tile by tile
@@ -29,11 +29,11 @@ def room_to_grow(device: torch.device, processes: Processes) -> float:
     """Return the bytes that a process may take beyond those in use, the same in all processes of a run; below 0 if too
     many are in use. Every process calls it."""
     if device.type == "cuda":
-        left = free_memory(device) - (1.0 - SHARE) * torch.cuda.mem_get_info(device)[1]
+        left = free_memory(device) - (1.0 - FILLED) * torch.cuda.mem_get_info(device)[1]
     else:
         used = torch.tensor(psutil.Process().memory_info().rss, dtype=torch.float64)
         processes.sum(used)
-        left = (SHARE * available_memory(float(used)) - float(used)) / processes.count
+        left = (FILLED * available_memory(float(used)) - float(used)) / processes.count
     least = torch.tensor(-left, dtype=torch.float64)
     processes.maximum(least)
     return -float(least)

@@ -10,14 +10,14 @@ from typing import Any
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 from bitymi_ns.train.init import PointReport, default_table_size, table_size_of
-from bitymi_ns.train.memory import SHARE
+from bitymi_ns.train.memory import FILLED
 from bitymi_ns.train.schedules import Schedule
 
 
 def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int = 1) -> list[str]:
     """Describe the short-run rules in force, and warn if the run ends before it has seen every photograph. `at_once`:
     views rendered per step."""
-    found = []
+    said = []
     if schedule.short_run_gain > 1.0:
         parts = [f"surfels learn {schedule.short_run_gain:.1f} times as fast"]
         densify, resets = sorted(schedule.densify_steps), len(schedule.reset_steps)
@@ -26,35 +26,35 @@ def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int =
         if field and schedule.freeze_every < schedule.config.freeze_every:
             rare = f"learns on 1 of {schedule.freeze_every} steps once it is frozen"
             parts.append(f"the texture field {rare if schedule.freeze_every > 1 else 'is never frozen'}")
-        found.append(f"Rules for runs of fewer than {REFERENCE_STEPS:,} steps: {'; '.join(parts)}.")
+        said.append(f"Rules for runs of fewer than {REFERENCE_STEPS:,} steps: {'; '.join(parts)}.")
     seen = schedule.max_steps * at_once
     if seen < views:
-        found.append(
+        said.append(
             f"A run of {schedule.max_steps:,} steps sees {seen:,} of the {views:,} training photographs, each once. "
             "Train for longer with --max-num-iterations."
         )
-    return found
+    return said
 
 
 def warnings_at_start(points: PointReport, config: TrainConfig, image_pixels: int, scene: SceneConfig) -> list[str]:
     """Describe the limits that the initial scene hits. `points`: counts of the sparse points used and dropped.
     `image_pixels`: total over all training images."""
-    found = []
+    said = []
     if points.over_cap:
         most, first = config.densify.max_surfels, config.first_surfels
         by_steps = first is not None and (most <= 0 or first < most)
         option, most = ("pipeline.model.train.first-surfels", first) if by_steps else ("max-surfels", most)
         what = f"{points.random:,} random points" if points.random else f"{points.given:,} points of the capture"
-        found.append(
+        said.append(
             f"Training starts from {most:,} surfels: {points.over_cap:,} of {what} are left out at random (--{option})."
         )
     size = default_table_size(image_pixels)
     if scene.texture == "hash" and scene.log2_table_size is None and table_size_of(image_pixels) > size:
-        found.append(
+        said.append(
             f"The texture field gets 2^{size} entries per level, the most that is chosen by itself; the photographs "
             f"could fill 2^{table_size_of(image_pixels)} (--pipeline.model.scene.log2-table-size)."
         )
-    return found
+    return said
 
 
 def held_back(count: int, most: int, config: TrainConfig) -> str:
@@ -70,7 +70,7 @@ def held_back(count: int, most: int, config: TrainConfig) -> str:
 def memory_reached(what: str, most: int) -> str:
     """Report that memory has stopped the growth of `what` ("Surfels") at a number of them."""
     return (
-        f"{what} stop growing at {most:,}, as {SHARE:.0%} of the memory is used up; the run goes on. To have more of "
+        f"{what} stop growing at {most:,}, as {FILLED:.0%} of the memory is used up; the run goes on. To have more of "
         "them, end other programs or train smaller photographs (--pipeline.datamanager.longest-side)."
     )
 

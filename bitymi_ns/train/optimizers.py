@@ -135,28 +135,18 @@ def replace_rows(
     new: Mapping[str, Tensor] | None = None,
     on_resize: ResizeHook | None = None,
 ) -> None:
-    """Keep the rows `keep` of every surfel parameter, in that order, and append the rows `new`.
+    """Keep the rows `keep` [n] int64 of every surfel parameter [N, ...], in that order, and append the rows `new`
+    [m, ...], by name; None: none.
 
-    Every entry of `surfels` becomes a new Parameter, also in its optimiser. Kept rows keep their optimiser state; that
-    of new rows is zero.
-
-    Args:
-        surfels: parameters by name, each [N, ...].
-        optimizers: by the same names, each with one group of that one parameter; some may be missing.
-        keep: [n] int64 row indices.
-        new: rows to append, by name, each [m, ...]; all names of `surfels`, or None for no new rows.
-        on_resize: called for every new Parameter.
-    """
+    Every entry of `surfels` becomes a new Parameter, also in its optimiser (one group of that one parameter; some may
+    be missing), and `on_resize` is called for it. Kept rows keep their optimiser state; that of new rows is zero."""
     for name in list(surfels.keys()):
         old = surfels[name]
+        added = 0 if new is None else len(new[name])
         rows = old.detach()[keep]
-        added = 0
-        if new is not None:
-            added = len(new[name])
-            rows = torch.cat([rows, new[name].detach().to(rows)])
+        rows = rows if new is None else torch.cat([rows, new[name].detach().to(rows)])
         parameter = Parameter(rows.contiguous(), requires_grad=old.requires_grad)
-        optimizer = optimizers.get(name)
-        if optimizer is not None:
+        if (optimizer := optimizers.get(name)) is not None:
             state = optimizer.state.pop(old, {})
             optimizer.param_groups[0]["params"] = [parameter]
             for key, value in state.items():
@@ -173,9 +163,8 @@ def replace_rows(
 def cap_opacity(
     surfels: ParameterDict, optimizers: Mapping[str, Optimizer], highest: float, forget_all: bool = False
 ) -> int:
-    """Clamp opacities to at most `highest`, in place, and reset the optimiser state of those lowered, or of all rows.
-
-    The old momentum would raise the opacities again at once. Returns the number of opacities lowered."""
+    """Clamp opacities to at most `highest`, in place, and reset the optimiser state of those lowered, or of all rows,
+    as the old momentum would raise them again at once. Returns the number of opacities lowered."""
     logits = surfels["opacity_logits"]
     limit = torch.logit(torch.tensor(highest, dtype=torch.float64)).item()
     above = logits > limit

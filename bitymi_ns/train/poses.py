@@ -82,9 +82,9 @@ def pose_step(gradient: Tensor, projection: Projection, pixels: float) -> Tensor
     across = fx * torch.stack([x * y, -(1.0 + x * x), y, -1.0 / z, zero, x / z], -1)
     down = fy * torch.stack([1.0 + y * y, -x * y, -x, zero, -1.0 / z, y / z], -1)
     curvature = torch.zeros(6, 6, dtype=torch.float64, device=z.device)
-    for rows_of, a in zip((across.double(), down.double()), weight[rows].double().unbind(1), strict=True):
+    for jacobian, a in zip((across.double(), down.double()), weight[rows].double().unbind(1), strict=True):
         # no matrix product: cuBLAS fails if torch is set to deterministic algorithms
-        curvature += (a[:, None, None] * rows_of[:, :, None] * rows_of[:, None, :]).sum(0)
+        curvature += (a[:, None, None] * jacobian[:, :, None] * jacobian[:, None, :]).sum(0)
     curvature = curvature.cpu()
     scale = curvature.diagonal().sqrt()
     if not bool((scale > 0).all()) or not bool(scale.isfinite().all()):
@@ -105,10 +105,7 @@ class Poses:
     """
 
     def __init__(self, schedule: Schedule, cameras: Sequence[Camera]) -> None:
-        """
-        Args:
-            cameras: training cameras at full size, with the poses of the capture.
-        """
+        """`cameras`: training cameras at full size, with the poses of the capture."""
         self.schedule = schedule
         self.motions: Tensor | None = None
         self._cameras = cameras
@@ -122,12 +119,8 @@ class Poses:
         return torch.stack([camera.viewmat.double().cpu() for camera in self._cameras])
 
     @cached_property
-    def _centers(self) -> Tensor:
-        return -(self._given[:, :3, :3] * self._given[:, :3, 3:]).sum(1)
-
-    @cached_property
     def _gauge(self) -> Tensor:
-        return gauge(self._centers, self.schedule.extent)
+        return gauge(-(self._given[:, :3, :3] * self._given[:, :3, 3:]).sum(1), self.schedule.extent)
 
     @property
     def refined(self) -> bool:
@@ -179,8 +172,8 @@ class Poses:
         return {"motions": self.motions}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
-        """Restore what `state_dict` returned, also if this run refines poses no further. `state`: None: a checkpoint
-        from before poses were refined. Ignored for another number of photographs."""
+        """Restore what `state_dict` returned, also if this run refines poses no further; not for another number of
+        photographs. `state`: None: a checkpoint from before poses were refined."""
         motions = None if state is None else state["motions"]
         if motions is not None and len(motions) == len(self._cameras):
             self.motions = motions
@@ -238,15 +231,15 @@ def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: fl
         return float(loss.detach()), gradient, output.projection
 
     best = view.camera.viewmat.double().cpu()
-    least, *found = judge(best)
+    least, *slope = judge(best)
     pixels = FIRST
     for _ in range(TRIES):
         if pixels < SHORTEST:
             break
-        candidate = moved(best, pose_step(*found, pixels))
-        loss, *there = judge(candidate)
+        candidate = moved(best, pose_step(*slope, pixels))
+        loss, *candidate_slope = judge(candidate)
         if loss < least:
-            best, least, found, pixels = candidate, loss, there, 1.5 * pixels
+            best, least, slope, pixels = candidate, loss, candidate_slope, 1.5 * pixels
         else:
             pixels *= 0.4
     return view.camera.posed(best)

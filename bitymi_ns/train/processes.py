@@ -70,10 +70,10 @@ class Processes:
         """Return the first problem reported by any process, by rank; None if there is none."""
         if self.count == 1 or not self.any(own is not None):
             return own
-        found: list[str | None] = [None] * self.count
+        problems: list[str | None] = [None] * self.count
         with raise_process_lost():
-            dist.all_gather_object(found, own)
-        return next(text for text in found if text is not None)
+            dist.all_gather_object(problems, own)
+        return next(problem for problem in problems if problem is not None)
 
     def mean(self, value: float) -> float:
         """Average a number that is equal in all processes up to rounding."""
@@ -142,9 +142,9 @@ class Processes:
             torch._foreach_div_(gradients, float(self.views))
 
     def _largest(self, values: Sequence[int]) -> list[int]:
-        found = torch.tensor(values, dtype=torch.int64)
-        self.maximum(found)
-        return found.tolist()
+        largest = torch.tensor(values, dtype=torch.int64)
+        self.maximum(largest)
+        return largest.tolist()
 
     @torch.no_grad()
     def _reduce(self, tensors: Sequence[Tensor], op: Any) -> None:

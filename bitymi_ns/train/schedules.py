@@ -2,14 +2,13 @@
 
 import math
 from dataclasses import replace
-from functools import cached_property
 
 from bitymi_ns.ops.view_kinds import PARAMETERS
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
 
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
-"""Number of views on which the error prune measures removals, as a share of the run's steps, and its minimum."""
+"""Number of views on which the error prune measures removals, as a fraction of the run's steps, and its minimum."""
 FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # likewise, for each of the four final prunes
 FEWEST_SURVEYED = 32  # minimum number of views to measure tiles on, in runs of any length
 PATIENT_STEPS = 3000  # runs of at least this many steps reach full size as early as the options say
@@ -23,6 +22,15 @@ class Schedule:
     short runs.
 
     `step` is the index of a training step, 0 to max_steps - 1. Events take place after that step's optimiser update.
+
+    Attributes:
+        in_pixels: the rate of the means is in pixels, see `step_sizes`; in world units otherwise.
+        short_run_gain: factor of the surfels' learning rates, above 1 in runs of fewer than 30,000 steps: Adam moves a
+            parameter by about its rate per step, so that shorter runs would end long before the surfels have converged.
+        freeze_every: interval of the steps that train the field after `freeze_after`.
+        error_views, final_views, survey_views: numbers of views on which the error prune and each final prune measure
+            removals, and on which tiles of texels are measured, or all if there are fewer.
+        texels_start, texel_steps: first step of the texel stage, and its number of steps.
     """
 
     def __init__(
@@ -42,11 +50,16 @@ class Schedule:
             raise ValueError(f"a run needs at least one step, not {max_steps}")
         if not (math.isfinite(extent) and extent > 0.0):
             raise ValueError(f"the scene extent must be positive and finite, not {extent}")
-        self.config = config
-        self.max_steps = max_steps
-        self.extent = float(extent)
+        self.config, self.max_steps, self.extent = config, max_steps, float(extent)
         check_ranges(config)
         self._texels, self.pixels = texels, pixels
+        self.in_pixels = config.lr.means is None
+        shortness = max(1.0, REFERENCE_STEPS / max_steps)
+        self.short_run_gain = min(config.lr.short_run_max, shortness**config.lr.short_run_power)
+        freezing = max_steps - self.scaled(config.freeze_after)
+        self.freeze_every = max(1, min(config.freeze_every, freezing // max(1, config.freeze_min_updates)))
+        self.error_views = max(FEWEST_ERROR_VIEWS, round(ERROR_VIEWS * max_steps))
+        self.final_views = max(FEWEST_FINAL_VIEWS, round(FINAL_VIEWS * max_steps))
         self.plan()
 
     def plan(self, begun: int | None = None) -> None:
@@ -58,6 +71,8 @@ class Schedule:
         interval = densify.interval * self._stride(densify.interval, densify.min_interval)
         start = self.scaled(config.texels.start) if begun is None else begun
         self.texels_start = min(self.max_steps, start) if self._texels else self.max_steps
+        self.texel_steps = self.max_steps - self.texels_start
+        self.survey_views = max(FEWEST_SURVEYED, round(config.texels.views * self.texel_steps))
         stop = min(densify.stop, config.texels.start) if self._texels else densify.stop
         # steps after which surfels are densified and pruned, opacities reset, and the error and final prunes run
         before = self.texels_start - 1
@@ -73,41 +88,6 @@ class Schedule:
             slower = config.lr.times(config.texels.surfel_rates)
             slower.mean_pixels = config.lr.times(config.texels.mean_rates).mean_pixels
             self._last_part = Schedule(replace(config, lr=slower), self.texel_steps, self.extent)
-
-    @property
-    def in_pixels(self) -> bool:
-        """True if the rate of the means is in pixels, see `step_sizes`; in world units otherwise."""
-        return self.config.lr.means is None
-
-    @property
-    def texel_steps(self) -> int:
-        """Number of steps of the texel stage."""
-        return self.max_steps - self.texels_start
-
-    @property
-    def error_views(self) -> int:
-        """Number of views on which the error prune measures removals, or all if there are fewer."""
-        return max(FEWEST_ERROR_VIEWS, round(ERROR_VIEWS * self.max_steps))
-
-    @property
-    def final_views(self) -> int:
-        """Number of views on which each final prune measures them, likewise."""
-        return max(FEWEST_FINAL_VIEWS, round(FINAL_VIEWS * self.max_steps))
-
-    @property
-    def survey_views(self) -> int:
-        """Number of views on which tiles of texels are measured, likewise."""
-        return max(FEWEST_SURVEYED, round(self.config.texels.views * self.texel_steps))
-
-    @cached_property
-    def short_run_gain(self) -> float:
-        """Factor of the surfels' learning rates, above 1 in runs of fewer than 30,000 steps.
-
-        Adam moves a parameter by about its rate per step, so a run of 600 steps at the published rates would end long
-        before the surfels have converged.
-        """
-        shortness = max(1.0, REFERENCE_STEPS / self.max_steps)
-        return min(self.config.lr.short_run_max, shortness**self.config.lr.short_run_power)
 
     def scaled(self, step_at_30k: float) -> int:
         """Scale a step count stated for 30,000 steps to this run: 0 stays 0, others become at least 1."""
@@ -142,9 +122,8 @@ class Schedule:
     def overdraw_counts(self, step: int) -> bool:
         """Return True if the overdraw loss is part of this step's objective."""
         loss = self.config.loss
-        return loss.overdraw_weight > 0.0 and (
-            self.scaled(loss.overdraw_start) <= step < self.scaled(loss.overdraw_stop)
-        )
+        first, last = self.scaled(loss.overdraw_start), self.scaled(loss.overdraw_stop)
+        return loss.overdraw_weight > 0.0 and first <= step < last
 
     def geometry_counts(self, step: int) -> bool:
         """Return True if the depth and normal losses are part of this step's objective, for views with such maps."""
@@ -162,30 +141,19 @@ class Schedule:
         return not self.densify_steps or step > max(self.densify_steps)
 
     def field_trains(self, step: int) -> bool:
-        """Return True if the texture is trained in this step; in other steps it is evaluated without gradient.
-
-        From `freeze_after` on the field is trained in one step of `freeze_every` (section Training Time of the paper);
-        short runs freeze less, since a tenth of their steps is too few. Texels are trained in every step of their
-        stage.
-        """
+        """Return True if the texture is trained in this step; in other steps it is evaluated without gradient. From
+        `freeze_after` on a field is trained in one step of `freeze_every` (section Training Time of the paper); short
+        runs freeze less, since a tenth of their steps is too few."""
         return self.texels_learn(step) or step < self.scaled(self.config.freeze_after) or step % self.freeze_every == 0
-
-    @property
-    def freeze_every(self) -> int:
-        """Interval of the steps that train the field after `freeze_after`."""
-        left = self.max_steps - self.scaled(self.config.freeze_after)
-        return max(1, min(self.config.freeze_every, left // max(1, self.config.freeze_min_updates)))
 
     def texels_learn(self, step: int) -> bool:
         """Return True in the texel stage."""
         return step >= self.texels_start
 
     def texel_rate(self, step: int, views: int = 1) -> float:
-        """Compute the rate of the texels in a step of the texel stage, per pass over `views` views.
-
-        The cosine decay to 0 halves the distance that texels can move. If the stage has too few passes over the views
-        to move them by `travel` at `rate`, the rate is raised.
-        """
+        """Compute the rate of the texels in a step of the texel stage, per pass over `views` views. The cosine decay to
+        0 halves the distance that they can move; if the passes are too few to move by `travel` at `rate`, that is
+        raised."""
         texels = self.config.texels
         needed = 2.0 * texels.travel * views / self.texel_steps
         return max(texels.rate, min(needed, texels.travel)) * self._falling(step)

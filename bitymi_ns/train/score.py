@@ -33,13 +33,10 @@ class Scores:
 
 def normalise(values: Tensor) -> Tensor:
     """Shift and scale values to [0, 1]; all zeros if they are equal or not finite."""
-    if values.numel() == 0:
-        return values
-    low, high = values.min(), values.max()
-    spread = high - low
+    spread = values.max() - values.min() if values.numel() else values.new_zeros(())
     if not bool(torch.isfinite(spread) & (spread > 1e-12)):
         return torch.zeros_like(values)
-    return (values - low) / spread
+    return (values - values.min()) / spread
 
 
 def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | None = None) -> Tensor:

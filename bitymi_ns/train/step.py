@@ -16,13 +16,14 @@ from torch.optim import Optimizer
 
 from bitymi_ns.ops.backend import give_back_memory
 from bitymi_ns.ops.parameters import SHAPE_LIMIT
+from bitymi_ns.ops.training_view import ComparedView, PhotographTarget
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import RenderOutput
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
 from bitymi_ns.train.exposure import Exposure
-from bitymi_ns.train.losses import fused_losses, objective, photograph_target
+from bitymi_ns.train.losses import fused_losses, objective
 from bitymi_ns.train.messages import memory_reached
 from bitymi_ns.train.optimizers import ResizeHook, set_rate
 from bitymi_ns.train.poses import Poses
@@ -45,7 +46,6 @@ from bitymi_ns.train.views import (
 if TYPE_CHECKING:
     from bitymi_ns.ops import TexelDescent
     from bitymi_ns.ops.project import Projection
-    from bitymi_ns.ops.training_view import ComparedView
     from bitymi_ns.scene.scene import Scene
 
 DROPOUT_NUMBERS = 1 << 30  # number of the first step's dropout; below are those of backgrounds and of the views' order
@@ -56,15 +56,8 @@ def with_dropout(opacity_logits: Tensor, probability: float, seed: int, step: in
     """Leave out surfels of a view at random, as dropout does with the units of a network (Srivastava et al. 2014).
 
     The odds of the others' opacities are divided by 1 - p, which for small opacities preserves the expected one. Those
-    left out are not drawn and have no gradient. The choice depends on `seed`, `step` and the kind of device.
-
-    Args:
-        opacity_logits: [N].
-        probability: p, from 0 to below 1.
-
-    Returns:
-        [N] logits to draw the view with.
-    """
+    left out are not drawn and have no gradient. The choice depends on `seed`, `step` and the kind of device. Returns
+    [N] logits to draw the view with. `probability`: p, from 0 to below 1."""
     numbers = random_numbers(seed, DROPOUT_NUMBERS + step, opacity_logits.device)
     left_out = torch.rand(opacity_logits.shape, generator=numbers, device=opacity_logits.device) < probability
     return torch.where(left_out, -SHAPE_LIMIT, opacity_logits - math.log1p(-probability))
@@ -80,11 +73,10 @@ def view_losses(
     descent: TexelDescent | None = None,
     dropout: float = 0.0,
 ) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
-    """Render a training view and compare it with its photograph.
+    """Render a training view and compare it with its photograph, as the options ask in this step of the schedule.
 
     Args:
         view: on the scene's device, with its image at its camera's size.
-        schedule, step: decide which parts of the scene are trained.
         background: [3] colour behind the scene, where it is constant over steps; None: as the options say.
         descent: see `Scene.render`.
         dropout: probability with which a surfel is left out.
@@ -107,7 +99,8 @@ def view_losses(
     overdraw_half = loss.overdraw_half if schedule.overdraw_counts(step) else None
     compared: ComparedView | None = None
     if not maps and overdraw_half is None and fused_losses(loss, target):
-        photograph = photograph_target(target, loss, view.mask, background)
+        weights = (loss.ssim_weight, loss.falloff_weight, loss.falloff_gamma)
+        photograph = PhotographTarget(target, view.mask, background, *weights)
         compared = scene.compare(view.camera, photograph, view.correction, field_mode, descent, logits)
     output = shown = compared or scene.render(view.camera, background, field_mode, maps, overdraw_half, descent, logits)
     if isinstance(output, RenderOutput):  # the other one is corrected already
@@ -162,13 +155,12 @@ class Training:
         grown = (on_resize, data.image_pixels, data.first_surfels, processes)
         self.strategy = Strategy(scene, optimizers, self.schedule, *grown)
         self.exposure = Exposure(config.exposure, data.exif_stops, data.files)
-        cameras = [view.camera for view in data.views] if data.cameras is None else data.cameras
-        self.poses = Poses(self.schedule, cameras)
+        self.poses = Poses(self.schedule, data.cameras)
         self.announce = announce
         self.guard = RollbackGuard(self.strategy, self.exposure, self.poses, announce)
         self.texels = LearningTexels(scene, self.schedule, processes)
         self.watch = LossWatch()
-        self.step_sizes = StepSizes(self.schedule, cameras)
+        self.step_sizes = StepSizes(self.schedule, data.cameras)
         self.clock = Stopwatch()
         self.background: Tensor | None = None
         self.step = 0
@@ -202,15 +194,13 @@ class Training:
         if not self._synchronised:
             self._synchronised = True
             device = self.scene.surfels["means"].device
-            found = self.processes.from_first(self.exposure.state_dict(), device)
-            self.exposure.load_state_dict(found, len(self._full_size), device)
-        grows = step > 0 and self.schedule.resolution_factor(step) != self.schedule.resolution_factor(step - 1)
+            self.exposure.load_state_dict(self.processes.from_first(self.exposure.state_dict(), device), device=device)
         began = self.texels.begin(step, self.views)
         if began:
             self.guard.restart()
             if self.texels.most_by_memory:
                 self.announce(memory_reached("Texels", self.texels.most_by_memory))
-        if began or grows:
+        if began or self.schedule.resolution_factor(step) != self.schedule.resolution_factor(max(0, step - 1)):
             give_back_memory()
         self.guard.before(step, self.views)
         self.step_sizes.measure(self.scene, always=began)
@@ -223,13 +213,12 @@ class Training:
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
         """Compute `view_losses`. If a loss is not finite, the guard repairs the scene and the view is rendered again.
         Raises TrainingDiverged: the scene cannot be repaired, or the limit of rollbacks is reached."""
-        passes = self.processes.views * self.schedule.max_steps / len(self._full_size)
-        dropout = self.schedule.dropout(passes)
+        dropout = self.schedule.dropout(self.processes.views * self.schedule.max_steps / len(self._full_size))
         while True:
             descent = self.texels.prepare(self.step, view, self.guard.factor)
             diverged: TrainingDiverged | None = None
+            how = (self.watch, self.background, descent, dropout)
             try:
-                how = (self.watch, self.background, descent, dropout)
                 terms, output = view_losses(self.scene, view, self.schedule, self.step, *how)
             except TrainingDiverged as error:
                 diverged = error
@@ -278,11 +267,13 @@ class Training:
         assert projections, "a step is finished after its losses"
         self._projections, self._photometric = [], []
         self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step), self.processes)
-        pixels = self.guard.factor * self.schedule.pose_pixels(step)
-        self.poses.step(projections, pixels, self.processes)
+        self.poses.step(projections, self.guard.factor * self.schedule.pose_pixels(step), self.processes)
         if not self.schedule.densification_over(step):
             self.strategy.accumulate(*projections)
-        loss = self._mean_over_views(photometric)
+        loss = photometric[0] if self.processes.views == 1 else torch.stack(photometric).sum()
+        if self.processes.views > 1:
+            self.processes.sum(loss)
+            loss = loss / self.processes.views
         factor = self.schedule.resolution_factor(step)
         try:
             report = self.strategy.step(step, lambda k, generator: self.views.draw(k, generator, factor))
@@ -298,13 +289,6 @@ class Training:
             self.watch.forget()
         self.clock.stop()
         return report
-
-    def _mean_over_views(self, losses: list[Tensor]) -> Tensor:
-        if self.processes.views == 1:
-            return losses[0]
-        loss = torch.stack(losses).sum()
-        self.processes.sum(loss)
-        return loss / self.processes.views
 
     @property
     def by_memory(self) -> dict[str, int]:

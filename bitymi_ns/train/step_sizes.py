@@ -36,8 +36,8 @@ def pixel_footprints(means: Tensor, cameras: Sequence[Camera], near: float, exte
         camera = camera.to(means.device)
         _, _, depth, inside = camera.project(means, near)
         nearest = torch.where(inside, torch.minimum(nearest, depth / _focal(camera)), nearest)
-    held = nearest[nearest.isfinite()]
-    typical = held.median() if len(held) else extent / _focal(cameras[0].to(means.device))
+    seen = nearest[nearest.isfinite()]
+    typical = seen.median() if len(seen) else extent / _focal(cameras[0].to(means.device))
     return torch.where(nearest.isfinite(), nearest, typical)
 
 
@@ -54,10 +54,7 @@ class StepSizes:
     """
 
     def __init__(self, schedule: Schedule, cameras: Sequence[Camera]) -> None:
-        """
-        Args:
-            cameras: the training cameras at full size.
-        """
+        """`cameras`: the training cameras at full size."""
         self.schedule = schedule
         self.cameras = [cameras[i] for i in spread(len(cameras), MEASURED)]
         self._set(torch.zeros(0))

@@ -198,14 +198,14 @@ class Strategy:
                 # shortly after an opacity reset all opacities are low
                 if not self.schedule.recovering(step):
                     faint = ~(clone | split) & (surfels["opacity_logits"].sigmoid() < self._replaceable)
-                    replaced = _lowest(surfels["opacity_logits"], faint, count - room)
+                    replaced = _lowest(faint, count - room, surfels["opacity_logits"])
                 weights = gradient.double() * (scores.importance + NO_BAD_PIXEL) * ~replaced
                 chosen = torch.zeros_like(clone)
                 chosen[self._draw(weights, room + int(replaced.sum()))] = True
                 clone, split = chosen & ~large, chosen & large
                 report |= {"replaced": int(replaced.sum())}
             else:
-                chosen = _strongest(clone | split, scores.importance, gradient, room)
+                chosen = _lowest(clone | split, room, -scores.importance, -gradient)
                 clone, split = clone & chosen, split & chosen
                 report |= {"held_back": count - int(chosen.sum())}
         clones, splits = clone.nonzero().flatten(), split.nonzero().flatten()
@@ -235,8 +235,8 @@ class Strategy:
         """End growth for the rest of the run if `wanted` more surfels than n, with their smallest tiles, might not fit
         beside a view at full size."""
         to_come = (1.0 - self.schedule.resolution_factor(step) ** 2) * view_bytes(self.schedule.pixels)
-        each = PER_SURFEL + PER_TEXEL * SMALLEST**2
-        fitting = n + max(0, int((room_to_grow(device, self.processes) - to_come) / each))
+        surfel_bytes = PER_SURFEL + PER_TEXEL * SMALLEST**2
+        fitting = n + max(0, int((room_to_grow(device, self.processes) - to_come) / surfel_bytes))
         if fitting >= n + wanted or 0 < self.most <= fitting:
             return {}
         self.most = self.most_by_memory = fitting
@@ -303,7 +303,7 @@ class Strategy:
         invisible = finite & (logits.sigmoid() <= ALPHA_MIN)
         if self.config.densify.max_surfels > 0:
             over = int(finite.sum() - invisible.sum()) - self.config.densify.max_surfels
-            invisible |= _lowest(logits, finite & ~invisible, over)
+            invisible |= _lowest(finite & ~invisible, over, logits)
         pruned = ~finite | self._keep_minimum(invisible, logits, int(finite.sum()), among=finite)
         self.remove(pruned)
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
@@ -317,7 +317,7 @@ class Strategy:
         if self.config.densify.max_surfels > 0:
             lowest = min(lowest, self.config.densify.max_surfels)
         missing = lowest - (count - int(pruned.sum()))
-        return pruned & ~_lowest(-opacity_logits, pruned, missing)
+        return pruned & ~_lowest(pruned, missing, -opacity_logits)
 
     def _draw(self, weights: Tensor, k: int) -> Tensor:
         """Sample k rows (at most the number of positive weights) without replacement, in proportion to `weights`.
@@ -357,20 +357,12 @@ def finite_rows(scene: Scene) -> Tensor:
     return finite
 
 
-def _lowest(values: Tensor, among: Tensor, k: int) -> Tensor:
-    """Select, [N] bool, the `k` rows with the lowest `values` [N] within `among` [N] bool."""
+def _lowest(among: Tensor, k: int, *values: Tensor) -> Tensor:
+    """Select, [N] bool, the `k` rows within `among` [N] bool with the lowest first `values` [N], equal ones by the next
+    ones."""
     rows = among.nonzero().flatten()
+    for keys in reversed(values):
+        rows = rows[keys.detach()[rows].argsort(stable=True)]
     chosen = torch.zeros_like(among)
-    chosen[rows[values.detach()[rows].argsort(stable=True)[: max(0, k)]]] = True
-    return chosen
-
-
-def _strongest(wanted: Tensor, importance: Tensor, gradient: Tensor, k: int) -> Tensor:
-    """Select, [N] bool, up to `k` of the `wanted` rows, by importance first and gradient second."""
-    rows = wanted.nonzero().flatten()
-    by_gradient = gradient[rows].argsort(descending=True, stable=True)
-    rows = rows[by_gradient]
-    rows = rows[importance[rows].argsort(descending=True, stable=True)]
-    chosen = torch.zeros_like(wanted)
-    chosen[rows[:k]] = True
+    chosen[rows[: max(0, k)]] = True
     return chosen

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
 FEW = 1 << 23  # total number of texels that runs of any length may have: 370 MB
 FEWER = 0.8  # factor on the texels per tile, repeated until the total is below the limit
-LEAST_SHARE = 0.25
-"""Lower bound of a texel's coverage if only a sample of the views is measured, as a share of the coverage in one view.
+LEAST_COVERAGE = 0.25
+"""Lower bound of a texel's coverage if only a sample of the views is measured, relative to the coverage in one view.
 It limits a texel's step to about four times the rate. A full view as bound would slow down occluded texels."""
 SURVEY_PIXELS = 10_000
 """Coverage is measured at half size if views have at least this many pixels then: as accurate, in half the time."""
@@ -52,6 +52,11 @@ class LearningTexels:
         self._views = 1
         self.most_by_memory = 0  # number of texels to which memory has limited the tiles; 0: it has not
 
+    @property
+    def views_to_come(self) -> int:
+        """Number of renders in the texel stage, over all processes."""
+        return self.processes.views * self.schedule.texel_steps
+
     def begin(self, step: int, views: DownscaledViews) -> bool:
         """Create the tiles on the first step of the texel stage; True on that step."""
         self._views = len(views)
@@ -60,25 +65,16 @@ class LearningTexels:
         sample = spread(len(views), self.schedule.survey_views)
         sampled = OnDemand(len(sample), lambda i: views.at(sample[i], 1.0))
         device = self.scene.surfels["means"].device
-        of_texel = PER_TEXEL + PER_TEXEL_SUM * (device.type == "cuda")
-        fitting = max(0, int(room_to_grow(device, self.processes) / of_texel))
+        texel_bytes = PER_TEXEL + PER_TEXEL_SUM * (device.type == "cuda")
+        fitting = max(0, int(room_to_grow(device, self.processes) / texel_bytes))
         made = None
         if self.processes.first:
             made = _blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come, fitting)
         stated = None if made is None else {**made[0].state_dict(), "bound": made[1]}
-        found = self.processes.from_first(stated, device)
-        if made is None:
-            field = TexelField(found["size"], found["extent"], found["texels"], found["share"], found.get("alpha"))
-        else:
-            field = made[0]
-        self.scene.field = field
-        self.most_by_memory = len(field.texels) if found["bound"] else 0
+        stated = self.processes.from_first(stated, device)
+        self.most_by_memory = len(stated["texels"]) if stated.pop("bound") else 0
+        self.scene.field = TexelField(**stated) if made is None else made[0]
         return True
-
-    @property
-    def views_to_come(self) -> int:
-        """Number of renders in the texel stage, over all processes."""
-        return self.processes.views * self.schedule.texel_steps
 
     def prepare(self, step: int, view: View, factor: float) -> TexelDescent | None:
         """Return the update of the texels by the backward pass of this view; with several views per step None, and
@@ -180,7 +176,7 @@ def _blank_texels(
     small = OnDemand(len(views), lambda i: at_size(views[i], smaller[i], extent.device))
     seen_in_all = coverage(scene, field, small) * (count / max(1, len(views)) / scale**2)
     if len(views) < count:
-        least = LEAST_SHARE * single_view_coverage(surfels, cameras, size, extent, scene.near)
+        least = LEAST_COVERAGE * single_view_coverage(surfels, cameras, size, extent, scene.near)
         seen_in_all = torch.maximum(seen_in_all, least)
     field.share.copy_(1.0 / (seen_in_all + options.prior))
     if options.alpha_rate > 0:
@@ -202,17 +198,11 @@ def single_view_coverage(
     surfels: Mapping[str, Tensor], cameras: Sequence[Camera], size: Tensor, extent: Tensor, near: float
 ) -> Tensor:
     """Estimate the coverage of each texel in one unoccluded view, pixels [T]: its area in the nearest view times the
-    surfel's opacity.
+    surfel's opacity. `cameras`: of the measured views; the others are assumed to be about as near. `size` and `extent`:
+    [N, 2] and [N] of the tiles.
 
     An unmeasured view may show texels that are occluded in all measured ones; by the measured coverage alone, their
-    steps would be a hundred times too long.
-
-    Args:
-        cameras: of the measured views; the others are assumed to be about as near.
-        size: [N, 2] of the tiles.
-        extent: [N] half sides of the tiles in scale units.
-        near: near plane.
-    """
+    steps would be a hundred times too long."""
     area = tile_pixels(surfels, cameras, extent, near).prod(1) / size.prod(1)
     return (area * surfels["opacity_logits"].sigmoid()).repeat_interleave(size.long().prod(1))
 
@@ -233,16 +223,8 @@ def tiles_as_seen(
     to_come: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
     """Choose tile sizes. A tile covers the part of its surfel where fragments reach the weight bound, at the resolution
-    of the views and with at most one texel per `options.pixels_per_texel`.
-
-    Args:
-        near: near plane.
-        weight_bound: fragments of smaller weight get no residual.
-        to_come: number of renders in the texel stage.
-
-    Returns:
-        Sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 if no fragment reaches the bound.
-    """
+    of the views and with at most one texel per `options.pixels_per_texel`. `to_come`: number of renders in the texel
+    stage. Returns sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 if no fragment reaches the bound."""
     extent = visible_extent(*kernel_parameters(surfels, seen.in_front), weight_bound)
     size = seen_sides(tile_pixels(surfels, cameras, extent, near), SMALLEST, options.largest)
     texels = seen.pixels / options.pixels_per_texel

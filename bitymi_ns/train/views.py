@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
 DOWNSCALED_BYTES = 1 << 28  # cache of downscaled images on the CPU; others are downscaled at every use
-COVERED_VIEWS = 8  # views sampled by `covered_share`
+COVERED_VIEWS = 8  # views sampled by `covered_fraction`
 
 
 class View(NamedTuple):
@@ -80,23 +80,23 @@ class TrainingData:
 
     Attributes:
         views: training views at full size.
+        cameras: of the views, which may read the photographs for it.
         extent: scene extent in world units (`init.scene_extent`).
         image_pixels: total over all training views.
         first_surfels: initial number of surfels, also in a resumed run.
-        covered: share of opaque, unmasked pixels (`covered_share`).
+        covered: fraction of opaque, unmasked pixels (`covered_fraction`).
         exif_stops: log2 exposure of each view (`capture.exif.exif_stops`), NaN: unknown; None: unknown for every view.
         files: photograph of each view, which views may share; None: one view per photograph.
-        cameras: cameras of the views; None: taken from the views, which may read the photographs for it.
     """
 
     views: Sequence[View]
+    cameras: Sequence[Camera]
     extent: float
     image_pixels: int
     first_surfels: int
-    covered: float = 1.0
+    covered: float
     exif_stops: Sequence[float] | None = None
     files: Sequence[Path] | None = None
-    cameras: Sequence[Camera] | None = None
 
 
 def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:
@@ -105,15 +105,15 @@ def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:
     return value.pin_memory().to(device, non_blocking=True)
 
 
-def covered_share(views: Sequence[View]) -> float:
-    """Measure the share of pixels that are neither masked nor transparent, on a sample of the views."""
-    shares = []
+def covered_fraction(views: Sequence[View]) -> float:
+    """Measure the fraction of pixels that are neither masked nor transparent, on a sample of the views."""
+    fractions = []
     for view in (views[i] for i in spread(len(views), COVERED_VIEWS)):
         shows = view.image[..., -1:] > 0 if view.image.shape[-1] == 4 else torch.ones((), dtype=torch.bool)
         if view.mask is not None:
             shows = shows & view.mask.reshape(*view.mask.shape[:2], 1)
-        shares.append(float(shows.float().mean()))
-    return sum(shares) / max(1, len(shares))
+        fractions.append(float(shows.float().mean()))
+    return sum(fractions) / max(1, len(fractions))
 
 
 def shown(rgb: Tensor, correction: Tensor | None, alpha: Tensor, background: Tensor | None) -> Tensor:
@@ -224,7 +224,7 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
     size = (camera.width, camera.height)
     mask = None if view.mask is None else downscale_mask(view.mask.to(device), *size)
     depth, normal = (
-        None if each is None else resample_nearest(each.to(device), *size) for each in (view.depth, view.normal)
+        None if values is None else resample_nearest(values.to(device), *size) for values in (view.depth, view.normal)
     )
     return View(camera, downscale_image(image, *size), mask, view.correction, depth, normal)
 
@@ -236,8 +236,7 @@ class DownscaledViews:
     images beyond it are copied at every use.
 
     Args:
-        views: at full size.
-        device: device of the returned images.
+        device: of the returned images.
         correction: returns the current correction of a view by its index; None: the view's own.
         pose: returns a view's camera, by its index, with the current pose; None: poses are fixed.
         resident_bytes: budget on a CUDA device; None: `photograph_budget`.

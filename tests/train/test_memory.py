@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from bitymi_ns.train import memory, strategy
-from bitymi_ns.train.memory import SHARE, room_to_grow
+from bitymi_ns.train.memory import FILLED, room_to_grow
 from bitymi_ns.train.processes import ALONE, Processes
 from bitymi_ns.train.texels import SMALLEST
 from tests.train.strategy_bench import Bench
@@ -29,7 +29,7 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.views import View
 
-memory.SHARE = 0.9  # with less nothing would grow here, beside the program itself
+memory.FILLED = 0.9  # with less nothing would grow here, beside the program itself
 memory.memory_limit = lambda: float(sys.argv[1])
 torch.set_num_threads(1)
 g = torch.Generator().manual_seed(0)
@@ -82,7 +82,7 @@ def test_what_is_left_is_a_share_of_what_there_is(taken: str | None, monkeypatch
     monkeypatch.setattr(psutil, "Process", lambda: SimpleNamespace(memory_info=lambda: SimpleNamespace(rss=used)))
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=available))
     monkeypatch.setattr(memory, "memory_limit", lambda: limit)
-    assert room_to_grow(CPU, ALONE) == pytest.approx(SHARE * min(available + used, limit) - used)
+    assert room_to_grow(CPU, ALONE) == pytest.approx(FILLED * min(available + used, limit) - used)
 
     def reduce(self: Processes, tensors: list[torch.Tensor], how: object) -> None:
         for tensor in tensors:
@@ -93,7 +93,7 @@ def test_what_is_left_is_a_share_of_what_there_is(taken: str | None, monkeypatch
 
     monkeypatch.setattr(Processes, "_reduce", reduce)
     there = min(available + 3e9, limit)
-    assert room_to_grow(CPU, Processes(0, 2)) == pytest.approx(min(1e8, (SHARE * there - 3e9) / 2))
+    assert room_to_grow(CPU, Processes(0, 2)) == pytest.approx(min(1e8, (FILLED * there - 3e9) / 2))
 
 
 @pytest.mark.parametrize("max_surfels", [0, 60])

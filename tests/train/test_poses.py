@@ -151,7 +151,7 @@ def test_cameras_are_carried_along_with_their_neighbours(ring):
     right, wrong = ring
     poses = Poses(Schedule(options("on"), 60), [view.camera for view in right])
     # smooth drift of a path around the object
-    x, y, z = poses._centers.unbind(1)
+    x, y, z = torch.stack([view.camera.exact_center for view in right]).unbind(1)
     poses.motions = 0.01 * torch.stack([0.3 * x, 0.2 * y, 0.1 * z, y, -x, 0.5 * x], 1)
     between = look_at_origin([3 * math.cos(0.1), 3 * math.sin(0.1), 0.9])
     found = poses.carried(between)

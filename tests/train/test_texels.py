@@ -15,7 +15,7 @@ from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.texels import (
-    LEAST_SHARE,
+    LEAST_COVERAGE,
     SMALLEST,
     LearningTexels,
     blank_texels,
@@ -142,7 +142,7 @@ def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None
     assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))
     half = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views represent all
     cameras = [view.camera for view in views]
-    least = LEAST_SHARE * single_view_coverage(scene.surfels, cameras, half.size, half.extent, scene.near).detach()
+    least = LEAST_COVERAGE * single_view_coverage(scene.surfels, cameras, half.size, half.extent, scene.near).detach()
     assert torch.allclose(half.share, 1 / (torch.maximum(2 * found, least) + OPTIONS.prior))
     with torch.no_grad():
         scene.surfels["sv_rgb"].fill_(0.2)  # avoids clipping
@@ -177,8 +177,8 @@ def test_views_that_were_not_looked_through_move_no_texel_far(textured, views) -
     for view in views[1:]:
         seen = coverage(scene, field, [view])
         far = max(far, float((seen / (counted + OPTIONS.prior)).max()))
-        assert float((seen * field.share).max()) < 1.5 / LEAST_SHARE  # times the rate
-    assert far > 1.5 / LEAST_SHARE
+        assert float((seen * field.share).max()) < 1.5 / LEAST_COVERAGE  # times the rate
+    assert far > 1.5 / LEAST_COVERAGE
 
 
 def test_a_run_with_texels_is_better_than_one_without(textured, make_scene, views) -> None:

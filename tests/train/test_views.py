@@ -9,7 +9,7 @@ from bitymi_ns.train.views import (
     View,
     as_float,
     at_size,
-    covered_share,
+    covered_fraction,
     downscale_image,
     downscale_mask,
     eval_background,
@@ -123,10 +123,10 @@ def test_pixels_that_show_something(cameras) -> None:
         0.25: View(camera, half, mask[..., 0]),
     }
     for share, view in shares.items():
-        assert covered_share([view]) == pytest.approx(share)
-    assert covered_share([View(camera, opaque, mask)]) == pytest.approx(0.5)
-    assert covered_share([shares[1.0], shares[0.5]]) == pytest.approx(0.75) and covered_share([]) == 0
-    assert covered_share([shares[1.0]] * 300) == 1
+        assert covered_fraction([view]) == pytest.approx(share)
+    assert covered_fraction([View(camera, opaque, mask)]) == pytest.approx(0.5)
+    assert covered_fraction([shares[1.0], shares[0.5]]) == pytest.approx(0.75) and covered_fraction([]) == 0
+    assert covered_fraction([shares[1.0]] * 300) == 1
 
 
 def test_every_view_comes_once_an_epoch():

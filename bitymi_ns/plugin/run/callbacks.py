@@ -34,7 +34,7 @@ from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.forecast import Forecast, Steps, expected_surfels
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import OnDemand, TrainingData, covered_share
+from bitymi_ns.train.views import OnDemand, TrainingData, covered_fraction
 from bitymi_ns.trust import json_of, no_links
 
 SOON = 60  # seconds: when a run that takes less will end is not said
@@ -59,8 +59,8 @@ class TrainingRun:
         dataset, views, facts = self.datamanager.train_dataset, self.datamanager.train_views, model.facts
         train, extent = dataset.cameras, scene_extent(facts.camera_centers, scene.surfels["means"])
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
-        counts = (facts.train_pixels, model.first_surfels, covered_share(views))
-        data = TrainingData(views, extent, *counts, exposure_stops(facts.files), facts.files, cameras)
+        counts = (facts.train_pixels, model.first_surfels, covered_fraction(views))
+        data = TrainingData(views, cameras, extent, *counts, exposure_stops(facts.files), facts.files)
         optimizers, processes = attributes.optimizers.optimizers, trainer.processes
         self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
         self.combine = self.training.combine

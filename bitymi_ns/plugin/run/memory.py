@@ -23,12 +23,12 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import TexelConfig
 from bitymi_ns.train.forecast import KEPT
 from bitymi_ns.train.memory import (
+    FILLED,
     PER_FRAGMENT,
     PER_PIXEL,
     PER_SURFEL,
     PER_TEXEL,
     PER_TEXEL_SUM,
-    SHARE,
     available_memory,
 )
 from bitymi_ns.train.texels import SMALLEST, most_texels
@@ -166,5 +166,5 @@ def _state(
     there = f"the {available / 1e9:.1f} GB that {where} has available"
     if low > available:
         warn(f"That is more than {there}. Close other programs, or {advice}.")
-    elif low < high and high > SHARE * available:
+    elif low < high and high > FILLED * available:
         warn(f"Surfels and texels stop growing before they fill {there}.")

@@ -91,8 +91,8 @@ def replace_stale(work: Path, photographs: Path, contents: str) -> None:
     for folder in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
         # an OSError may also be the lock of a process that uses it
         with suppress(OSError, ValueError, LookupError, TypeError):
-            of = folder != work and is_own(folder) and read_json(folder / OF)
-            if of and of["source"] == source and of["contents"] != contents:
+            record = folder != work and is_own(folder) and read_json(folder / OF)
+            if record and record["source"] == source and record["contents"] != contents:
                 for mark in folder.glob(f"{IN_USE}*"):
                     locks.Lock(mark, tell=lambda text: None).release()
                 with locks.Lock(folder / ".lock", tell=lambda text: None):

@@ -94,16 +94,16 @@ def _find_folder(
         return max((count(each) for each in (path, copies) if each.is_dir()), default=0)
 
     portable = [name for name in names if leads_inside(name)]
-    exact = {each: most(each, lambda at: sum(os.path.isfile(at / name) for name in portable)) for each in folders}
+    exact = {path: most(path, lambda at: sum(os.path.isfile(at / name) for name in portable)) for path in folders}
     best = max(folders, key=exact.__getitem__)  # the first of equals
     if not need_photos or exact[best] == len(names):
         return best
     # a folder above the capture may be the root of a disk, which is not searched
-    searched = [each for each in exact if each.is_relative_to(capture) or each.name in USUAL_FOLDERS]
-    counts = {each: most(each, lambda at: len({*FileFinder(at).find_all(names)} - {None})) for each in searched}
-    other = max(counts, key=counts.__getitem__)
-    if counts[other] > exact[best]:
-        return other
+    searched = [path for path in exact if path.is_relative_to(capture) or path.name in USUAL_FOLDERS]
+    counts = {path: most(path, lambda at: len({*FileFinder(at).find_all(names)} - {None})) for path in searched}
+    fitting = max(counts, key=counts.__getitem__)
+    if counts[fitting] > exact[best]:
+        return fitting
     if exact[best] == 0:
         near = [hint for each in searched if each.is_dir() and (hint := FileFinder(each).nearest(names[0], names))]
         hint = f" ({near[0]})" if near else ""
@@ -132,15 +132,15 @@ def warn_left_out(source: Source) -> set[Path]:
 
 def photographs_of(source: Source) -> list[Photograph]:
     """List the photographs of a model in the order of their names, with cameras and poses."""
-    model, found = source.model, []
+    model, photographs = source.model, []
     for image, file in zip(model.images, source.files(), strict=True):
         w, *xyz = image.qvec / np.linalg.norm(image.qvec)
         pose: Pose = np.eye(4)
         pose[:3] = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*xyz, w])), image.tvec).inverse().matrix()
         pose = TO_Z_UP @ pose @ OPENCV_AXES
         label = f"camera {image.camera_id} of {source.folder}"
-        found.append(Photograph(file, model.cameras[image.camera_id], pose, label, frame=image.frame))
-    return found
+        photographs.append(Photograph(file, model.cameras[image.camera_id], pose, label, frame=image.frame))
+    return photographs
 
 
 def model_points(model: Model, frame: Pose) -> Points:

@@ -53,12 +53,12 @@ def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
 def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
     """Find depth and confidence of a scanner's photographs: files of their names in `depth` and `confidence` beside
     their folder (Polycam, Record3D, ScanNet). Warn of a folder of color pictures, which is not used."""
-    found = [maps_called(path.parent.parent, f"depth/{path.stem}", f"confidence/{path.stem}") for path in photographs]
-    depths = [files.depth for files in found if files.depth is not None]
+    maps = [maps_called(path.parent.parent, f"depth/{path.stem}", f"confidence/{path.stem}") for path in photographs]
+    depths = [files.depth for files in maps if files.depth is not None]
     if depths and all(_is_color(depths[i]) for i in spread(len(depths), COLOR_SAMPLES)):
         warn(f"{depths[0].parent} is not used: it holds color pictures, not depth.")
-        return [MapFiles()] * len(found)
-    return found
+        return [MapFiles()] * len(maps)
+    return maps
 
 
 def _is_color(path: Path) -> bool:
@@ -160,7 +160,7 @@ def _read_exr(path: Path, check: Check) -> npt.NDArray[Any]:
         shape = (box.max.y - box.min.y + 1, box.max.x - box.min.x + 1)
         check(shape)
         kinds = {name: ("u4", "f2", "f4")[channel.type.v] for name, channel in channels.items()}
-        names = next(each for each in ("RGB", "Y", "Z", list(kinds)) if kinds.keys() >= set(each))
+        names = next(wanted for wanted in ("RGB", "Y", "Z", list(kinds)) if kinds.keys() >= set(wanted))
         if len(names) != 1 and names != "RGB":
             raise ValueError(f"R, G and B, Y, Z or a single channel are read, and it has {', '.join(kinds)}")
         planes = zip(names, image.channels(list(names)), strict=True)
@@ -170,13 +170,13 @@ def _read_exr(path: Path, check: Check) -> npt.NDArray[Any]:
 
 def _check_exr_header(file: IO[bytes]) -> None:
     """Raise ValueError if the header lacks an attribute that every EXR file has: OpenEXR crashes on such files."""
-    data, at, names = file.read(EXR_HEADER), 8, set()
+    data, start, names = file.read(EXR_HEADER), 8, set()
     file.seek(0)
-    while data[at : at + 1] not in (b"", b"\0"):
-        end = data.index(b"\0", at)
+    while data[start : start + 1] not in (b"", b"\0"):
+        end = data.index(b"\0", start)
         kind = data.index(b"\0", end + 1)
-        names.add(data[at:end].decode("latin1"))
-        at = kind + 5 + int.from_bytes(data[kind + 1 : kind + 5], "little")
+        names.add(data[start:end].decode("latin1"))
+        start = kind + 5 + int.from_bytes(data[kind + 1 : kind + 5], "little")
     if missing := [name for name in EXR_ATTRIBUTES if name not in names]:
         raise ValueError(f"its header has no {missing[0]}")
 

@@ -14,7 +14,7 @@ from bitymi_ns.capture.folder_contents import is_picture, open_picture
 from bitymi_ns.capture.image_files import has_transparency, image_size, in_proportion, in_threads, wrong_size
 from bitymi_ns.capture.kinds import DYNAMIC, MASK, PHOTOGRAPHS
 from bitymi_ns.capture.sfm_photos import COPY
-from bitymi_ns.capture.types import CaptureError, Photograph, fail, parsing, say
+from bitymi_ns.capture.types import Photograph, fail, parsing, say
 from bitymi_ns.trust import listed
 
 LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"  # remedy in messages
@@ -37,7 +37,7 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
     reduced = [masks.with_name(f"{masks.name}_{downscale}") for masks in whole if downscale > 1]
     masks = next(filter(os.path.isdir, (*whole, *reduced)), None)
     if masks is None and stated is not None:
-        fail(f"the folder of masks {stated} does not exist")
+        fail(f"the folder of masks {stated} does not exist. Give its path, for --masks-path seen from {data}.")
     return masks
 
 
@@ -113,10 +113,7 @@ def with_masks(
     files = [each.file for each in photographs]
     base = base or Path(os.path.commonpath([os.path.abspath(file.parent) for file in files]))
     names = [os.path.normpath(os.path.relpath(file, images or base)) for file in files]
-    try:
-        masks = mask_folder(base, capture, None if stated is None else capture / stated, downscale)
-    except CaptureError as error:
-        fail(f"{error}. Give it, seen from {capture}, with --masks-path.", error)
+    masks = mask_folder(base, capture, None if stated is None else capture / stated, downscale)
     mask_of, beside = find_masks(names, base, masks, stated is not None)
     missing = [name for name in names if name not in mask_of]
     if masks and missing and not beside and (mask_of or stated or images):

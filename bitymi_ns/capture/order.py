@@ -18,11 +18,11 @@ class Neighbours:
     """Sequences of photographs: files in one folder, of any cameras, whose names differ only in numbers."""
 
     def __init__(self, files: Sequence[Path]) -> None:
-        found = defaultdict(list)
+        sequences = defaultdict(list)
         for index, file in enumerate(files):
             sequence, position = _numbered(file)
-            found[sequence].append((position, index))
-        self._sequences = {sequence: sorted(members) for sequence, members in found.items()}
+            sequences[sequence].append((position, index))
+        self._sequences = {sequence: sorted(members) for sequence, members in sequences.items()}
 
     def of(self, file: Path) -> tuple[int, int, float] | None:
         """Return the indices of the previous and next photograph, and the file's position between them, 0 to 1, by the
@@ -33,7 +33,7 @@ class Neighbours:
             return None
         after = bisect_left(members, (position,))
         (low, first), (high, last) = members[max(after - 1, 0)], members[min(after, len(members) - 1)]
-        share = next(((at - a) / (b - a) for a, at, b in zip(low, position, high, strict=True) if a != b), 0.0)
+        share = next(((n - a) / (b - a) for a, n, b in zip(low, position, high, strict=True) if a != b), 0.0)
         return first, last, share
 
 

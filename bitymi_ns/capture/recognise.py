@@ -37,13 +37,13 @@ class Found:
     """nerfstudio, instant-ngp: transforms.json; blender, photographs: the folder; colmap: that of the model; video: the
     file."""
     folder: Path  # of the capture, to which names in its files are relative
-    others: tuple[tuple[Format, Path], ...] = ()  # captures beside it that are not read
+    beside: tuple[tuple[Format, Path], ...] = ()  # captures beside it that are not read
     unread: tuple[str, ...] = ()  # files of poses that are not read, with what converts them
 
     def how_to_choose(self) -> str:
         """Describe captures that are not read, and how to read them; empty if there are none."""
         ways = []
-        for format, path in self.others:
+        for format, path in self.beside:
             option = f"--format {format}"
             if format == "colmap" and self.format == "colmap":
                 option = f"--colmap-path {path.relative_to(self.folder)}"
@@ -77,11 +77,11 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
         fail(_nothing(data, format, candidates))
     (chosen, path), *_ = fitting
     # photographs belong to the capture beside them, but not to a video
-    others = [each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video")]
+    beside = [each for each in candidates if each[1] != path and (each[0] != "photographs" or chosen == "video")]
     if chosen == "stray-scanner":
-        others = [each for each in others if each[1].name != STRAY[2]]
+        beside = [each for each in beside if each[1].name != STRAY[2]]
     poses = folder_contents.poses_in(folder) if chosen in ("photographs", "video") else ()
-    return Found(chosen, path, path if chosen == "blender" else folder, tuple(others), poses)
+    return Found(chosen, path, path if chosen == "blender" else folder, tuple(beside), poses)
 
 
 def _capture_within(folder: Path, format: Format | Literal["auto"]) -> Path | None:

@@ -25,7 +25,7 @@ def rays_of(lens: Lens) -> np.ndarray:
 
 
 def directions(lens: Lens, width: int, height: int) -> np.ndarray:
-    """Render a photograph whose colours are the directions, [height, width, 3]."""
+    """Render a photograph whose colors are the directions, [height, width, 3]."""
     camera = lens.camera.colmap
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = camera.cam_ray_from_img(np.stack([x, y], -1).reshape(-1, 2)).reshape(height, width, 3)

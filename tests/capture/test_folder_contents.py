@@ -122,7 +122,7 @@ def test_a_film_of_ours_is_no_video_to_train_on(tmp_path: Path) -> None:
     (tmp_path / "film.mp4").write_bytes(b"ftyp" + RENDERED)
     (tmp_path / "walk.mp4").write_bytes(b"ftyp")
     found = recognise(tmp_path)
-    assert (found.path, found.others) == (tmp_path / "walk.mp4", ())
+    assert (found.path, found.beside) == (tmp_path / "walk.mp4", ())
     assert passed_over(tmp_path) == ["film.mp4 (a film of ns-render)"]
 
 

@@ -82,7 +82,7 @@ def test_a_colmap_model_is_found_and_photographs_beside_it_are_not_another_thing
     folder = tmp_path / "capture"
     model(folder / place)
     found = recognise(folder)
-    assert (found.format, found.path, found.folder, found.others) == ("colmap", folder / place, folder, ())
+    assert (found.format, found.path, found.folder, found.beside) == ("colmap", folder / place, folder, ())
     assert recognise(folder / place / "cameras.bin").path == folder / place
 
 
@@ -251,7 +251,7 @@ def test_poses_in_a_file_of_another_name(tmp_path: Path) -> None:
     path.unlink()
     assert recognise(tmp_path).unread[0].startswith("poses_bounds.npy (LLFF; write each as 4 x 4 numbers")
     usual = transforms(tmp_path, **PINHOLE)
-    assert (recognise(tmp_path).path, recognise(tmp_path).others, recognise(tmp_path).unread) == (usual, (), ())
+    assert (recognise(tmp_path).path, recognise(tmp_path).beside, recognise(tmp_path).unread) == (usual, (), ())
 
 
 def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:

@@ -119,7 +119,7 @@ def test_a_file_that_is_not_what_its_name_says_is_converted(tmp_path: Path, name
     assert not read_photo(tmp_path, name).plain
 
 
-def test_colours_of_another_profile_are_those_of_screens(tmp_path: Path) -> None:
+def test_colors_of_another_profile_are_those_of_screens(tmp_path: Path) -> None:
     Image.new("RGB", (64, 64), (200, 100, 80)).save(tmp_path / "a.webp", lossless=True, icc_profile=DISPLAY_P3)
     assert upright(read_photo(tmp_path, "a.webp")).getpixel((9, 9))[0] > 205
     pixels = np.full((4, 4, 4), (200, 100, 80, 60), np.uint8)

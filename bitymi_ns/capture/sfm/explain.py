@@ -169,8 +169,8 @@ def drop_unlinked(model: pycolmap.Reconstruction) -> None:
     if not len(part):
         return
     largest = np.bincount(part).argmax()
-    for image, of in zip(placed, part, strict=True):
-        if of != largest:
+    for image, group in zip(placed, part, strict=True):
+        if group != largest:
             model.deregister_frame(image.frame_id)
 
 

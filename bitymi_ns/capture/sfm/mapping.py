@@ -27,26 +27,22 @@ TELLING = 100  # least matches of all pairs that blame poses which give no point
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
     """Find the best model of the photographs; None = none. Verified pairs connect `connected` of them."""
-    found = None
-    if job.mapper in ("auto", "global"):
-        found = _mapped(_global, job, database, tell)
-        if job.mapper == "global":
-            return found
-        if found is not None and found.num_reg_images() >= ENOUGH * connected:
-            exact = found.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
-            if exact and contradicted(found, database, job.pixel) <= CONTRADICTED:
-                return found
-    return better(job, database, found, _mapped(_incremental, job, database, tell))
+    model = None if job.mapper == "incremental" else _mapped(_global, job, database, tell)
+    if job.mapper == "global":
+        return model
+    if model is not None and model.num_reg_images() >= ENOUGH * connected:
+        exact = model.compute_mean_reprojection_error() <= GOOD_ERROR * job.pixel
+        if exact and contradicted(model, database, job.pixel) <= CONTRADICTED:
+            return model
+    return better(job, database, model, _mapped(_incremental, job, database, tell))
 
 
 def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
     """Choose the model with most cameras, of equals that which fewest matches contradict; None = none."""
-    found = [model for model in models if model is not None]
-    most = max((model.num_reg_images() for model in found), default=0)
-    equal = [model for model in found if model.num_reg_images() == most]
-    if len(equal) < 2:
-        return equal[0] if equal else None
-    return min(equal, key=lambda model: contradicted(model, database, job.pixel))
+    known = [model for model in models if model is not None]
+    most = max((model.num_reg_images() for model in known), default=0)
+    equal = [model for model in known if model.num_reg_images() == most]
+    return min(equal, key=lambda m: contradicted(m, database, job.pixel) if len(equal) > 1 else 0.0, default=None)
 
 
 def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> pycolmap.Reconstruction | None:

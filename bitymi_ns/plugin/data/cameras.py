@@ -49,10 +49,10 @@ def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
     """Fail or warn if a pinhole camera of either split sees nothing, or its focal length does not fit its size."""
 
     def column(name: str) -> Tensor:
-        return torch.cat([getattr(some, name).flatten() for some in cameras]).double()
+        return torch.cat([getattr(split, name).flatten() for split in cameras]).double()
 
     fx, fy, cx, cy, width, height = (column(name) for name in ("fx", "fy", "cx", "cy", "width", "height"))
-    poses = torch.cat([some.camera_to_worlds.flatten(1) for some in cameras])
+    poses = torch.cat([split.camera_to_worlds.flatten(1) for split in cameras])
     off_axis = torch.hypot((cx - 0.5 * width) / fx, (cy - 0.5 * height) / fy)
     far = f"so far from the picture that this lies more than {MAX_OFF_AXIS} degrees off its axis"
     for what, wrong in (

@@ -78,7 +78,7 @@ class CaptureFacts:
 
     def select(self, indices: Sequence[int]) -> CaptureFacts:
         per_view = {name: getattr(self, name) for name in ("lenses", "files", "maps", "fitted")}
-        return replace(self, **{name: [some[i] for i in indices] for name, some in per_view.items() if some})
+        return replace(self, **{name: [values[i] for i in indices] for name, values in per_view.items() if values})
 
     @property
     def has_maps(self) -> bool:

@@ -49,10 +49,11 @@ def make_views(
     transform, scale = training_frame(poses, frame, source)
     moved = transform @ poses
     moved[:, :3, 3] *= scale
-    of, names, cameras, facts = _split(parts, moved, [photograph.file for photograph in photographs])
+    sources, names, cameras, facts = _split(parts, moved, [photograph.file for photograph in photographs])
     lenses = facts.lenses
-    maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(of, lenses, strict=True)]
-    wide = {photographs[i].file for i, lens in zip(of, lenses, strict=True) if lens.face and photographs[i].maps.depth}
+    maps = [MapFiles() if lens.face else photographs[i].maps for i, lens in zip(sources, lenses, strict=True)]
+    wide = {photographs[i].file for i, lens in zip(sources, lenses, strict=True)
+            if lens.face and photographs[i].maps.depth}  # fmt: skip
     if wide:
         say(f"Depth of photographs that become faces of a cube is not used: {listed(sorted(wide))}.")
     facts = dataclasses.replace(
@@ -65,7 +66,7 @@ def make_views(
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * capture.applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
-    masks: list[Any] = [photographs[i].mask for i in of]  # some may have none
+    masks: list[Any] = [photographs[i].mask for i in sources]  # some may have none
     side = frame.scene_scale
     views = Views(
         image_filenames=names,
@@ -78,7 +79,7 @@ def make_views(
         dataparser_transform=torch.from_numpy(transform if capture.applied is None else transform @ capture.applied),
     )
     chosen = {name: set(part) for name, part in capture.parts.items()}
-    return {name: select_views(views, [i for i, n in enumerate(of) if n in part]) for name, part in chosen.items()}
+    return {name: select_views(views, [i for i, n in enumerate(sources) if n in part]) for name, part in chosen.items()}
 
 
 def _split(
@@ -86,13 +87,13 @@ def _split(
 ) -> tuple[list[int], list[Path], Cameras, CaptureFacts]:
     """Split photographs into views of their lenses (`parts`); poses [N, 3 or 4, 4] are camera to world in nerfstudio's
     axes. Return the number of each view's photograph, and the views' names, cameras and facts."""
-    lenses = [lens for some in parts for lens in some]
-    of = [i for i, some in enumerate(parts) for _ in some]
+    lenses = [lens for own in parts for lens in own]
+    sources = [i for i, own in enumerate(parts) for _ in own]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
-    files = [photographs[i] for i in of]
-    cameras = pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(poses[of] @ turns).float())
+    files = [photographs[i] for i in sources]
+    cameras = pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(poses[sources] @ turns).float())
     names = [lens.name(file) for file, lens in zip(files, lenses, strict=True)]
-    return of, names, cameras, CaptureFacts(lenses, files)
+    return sources, names, cameras, CaptureFacts(lenses, files)
 
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
@@ -149,9 +150,11 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
         camera = ColmapCamera(model, *size, size if model == SPHERICAL_MODEL else (*pinhole, *coefficients))
         photographs.append(Photograph(file, camera, np.eye(4), f"the camera of {file}"))
     poses = cameras.camera_to_worlds.double().numpy()
-    of, names, cameras, facts = _split(make_lenses(photographs), poses, outputs.image_filenames)
+    sources, names, cameras, facts = _split(make_lenses(photographs), poses, outputs.image_filenames)
     metadata = {**outputs.metadata, KEY: facts}
-    return dataclasses.replace(select_views(outputs, of), image_filenames=names, cameras=cameras, metadata=metadata)
+    return dataclasses.replace(
+        select_views(outputs, sources), image_filenames=names, cameras=cameras, metadata=metadata
+    )
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:

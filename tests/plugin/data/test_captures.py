@@ -88,8 +88,8 @@ def test_an_alpha_channel_without_a_transparent_pixel_is_none(capture: Path) -> 
     assert load(capture).train_dataset.facts.transparent is True
 
 
-def test_the_colour_behind_transparent_photographs() -> None:
-    """The stated colour replaces any fixed one, as in runs of earlier versions."""
+def test_the_color_behind_transparent_photographs() -> None:
+    """The stated color replaces any fixed one, as in runs of earlier versions."""
     white = torch.ones(3)
     for given, transparent, wanted in (
         ("auto", True, "auto"), ("auto", False, "white"), ("random", True, "random"), ("black", True, "white")

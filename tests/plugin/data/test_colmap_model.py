@@ -42,7 +42,7 @@ def test_spheres_of_sphere_sfm(project: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("colours", "expected"),
+    ("colors", "expected"),
     [
         (("200 10 0", "1 0 1"), [[200, 10, 0], [1, 0, 1]]),
         (("0.8 0.04 0", "1 0 1"), [[204, 10, 0], [255, 0, 255]]),
@@ -50,8 +50,8 @@ def test_spheres_of_sphere_sfm(project: Path) -> None:
         (("200.0 10.4 0.0", "1 0 1"), [[200, 10, 0], [1, 0, 1]]),
     ],
 )
-def test_colours_by_which_white_they_fit(project: Path, colours: tuple[str, str], expected: list[list[int]]) -> None:
-    model = read_model(points(project, f"0 0 0.5 {colours[0]} 0.5", f"0.1 0 0.5 {colours[1]} 0.5"))
+def test_colors_by_which_white_they_fit(project: Path, colors: tuple[str, str], expected: list[list[int]]) -> None:
+    model = read_model(points(project, f"0 0 0.5 {colors[0]} 0.5", f"0.1 0 0.5 {colors[1]} 0.5"))
     assert model.rgb.tolist() == expected and not model.without_colors
 
 

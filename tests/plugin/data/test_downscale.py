@@ -51,7 +51,7 @@ def test_odd_sizes_keep_the_rays_of_the_corners(capture: Path) -> None:
         assert rays[0] == pytest.approx(rays[1], abs=1e-5)
 
 
-def test_transparent_photographs_keep_their_colours(tmp_path: Path, capture: Path) -> None:
+def test_transparent_photographs_keep_their_colors(tmp_path: Path, capture: Path) -> None:
     """Colours of transparent pixels do not bleed into others."""
     pixels = np.zeros((36, 48, 4), np.uint8)
     pixels[:, ::2] = (200, 100, 50, 255)  # every other column; the rest is transparent black

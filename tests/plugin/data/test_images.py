@@ -56,7 +56,7 @@ def test_deep_grey_pictures_are_scaled(
     assert np.array_equal(np.asarray(read_image(tmp_path / name)), as_rgb(grey))
 
 
-def test_deep_colour_is_scaled(picture: np.ndarray, tmp_path: Path) -> None:
+def test_deep_color_is_scaled(picture: np.ndarray, tmp_path: Path) -> None:
     for name in ("a.png", "a.tiff"):
         cv2.imwrite(str(tmp_path / name), picture[..., ::-1].astype(np.uint16) * 257)
         assert np.array_equal(np.asarray(read_image(tmp_path / name)), picture)
@@ -122,7 +122,7 @@ def test_masks_without_a_pixel(capture: Path, capsys: pytest.CaptureFixture[str]
         load(capture)
 
 
-def test_the_colour_for_what_masks_exclude(capture: Path) -> None:
+def test_the_color_for_what_masks_exclude(capture: Path) -> None:
     add_masks(capture, 255)
     Image.fromarray(np.uint8(np.arange(48) % 2 * 255)[None].repeat(36, 0)).save(capture / "masks/frame_00002.png")
     stock = NerfstudioDataParserConfig(mask_color=(1.0, 0.0, 0.5), eval_mode="interval")

@@ -1,4 +1,4 @@
-"""Point clouds: whole and damaged ones of every form, and their colours."""
+"""Point clouds: whole and damaged ones of every form, and their colors."""
 
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,7 @@ def test_a_handful_of_points_is_doubted(capsys: pytest.CaptureFixture[str]) -> N
 
 
 def colored(path: Path, kind: str, values: np.ndarray, format: str) -> Path:
-    """Write a cloud in which only the colours [N, 3] matter."""
+    """Write a cloud in which only the colors [N, 3] matter."""
     order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(format)
     names = [f"property float {name}\n" for name in "xyz"] + [
         f"property {kind} {n}\n" for n in ("red", "green", "blue")

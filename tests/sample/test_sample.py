@@ -137,12 +137,11 @@ def test_same_seed_same_capture(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_refuses_to_replace_what_is_there(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
-        generate(tmp_path, views=1)
     with pytest.raises(NotADirectoryError):
         generate(tmp_path / "mine.txt", views=1)
-    with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
-        generate(tmp_path, views=1, width=16, height=12, overwrite=True)
+    for overwrite in (False, True):
+        with pytest.raises(FileExistsError, match="is not a sample capture and is not replaced"):
+            generate(tmp_path, views=1, width=16, height=12, overwrite=overwrite)
     assert (tmp_path / "mine.txt").read_text() == "precious"
     folder = generate(tmp_path / "room", views=1, width=16, height=12, points=0)
     with pytest.raises(FileExistsError, match="is there already: .*--overwrite"):

@@ -24,19 +24,8 @@ from bitymi_ns.plugin.data.capture_checks import bitymi_parser
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.data.facts import CaptureFacts
 from bitymi_ns.plugin.data.views import with_lenses
-from tests.captures import (
-    colmap_model,
-    edit,
-    edit_frames,
-    expect,
-    held_out,
-    images_of,
-    load,
-    load_any,
-    load_with,
-    printed,
-    reduce_photographs,
-)
+from tests import captures
+from tests.captures import colmap_model, edit, edit_frames, expect, held_out, images_of, load, load_any, printed
 from tests.formats import instant_ngp
 
 
@@ -129,15 +118,15 @@ def test_every_camera_is_turned_with_its_capture(capture: Path, monkeypatch: pyt
     assert works is turned  # or one of the two captures proves nothing
 
 
-def test_the_captures_own_lists_decide_what_is_held_out(capture: Path) -> None:
+def test_the_captures_own_lists_decide_what_is_held_out(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names = [f"images/{path.name}" for path in images_of(capture)]
     edit(capture, lambda meta: meta.update(train_filenames=names[3:], val_filenames=names[1:3]))
     one = load_any(capture)
     equal(one, stock(capture))
     assert held_out(one) == ["frame_00002.png", "frame_00003.png"]
-    other = load_any(capture, eval_names=("frame_00012.png",))  # options override the file
-    assert held_out(other) == ["frame_00012.png"]
-    assert len(other.train_dataset) == 11
+    other = load_any(capture, eval_names=("images/frame_00003.png", "frame_00012.png"))  # options override the file
+    assert held_out(other) == ["frame_00003.png", "frame_00012.png"] and len(other.train_dataset) == 10
+    assert "2 of 12 photographs, by --eval-names (frame_00003.png, frame_00012.png)" in printed(capsys)
 
 
 @pytest.mark.parametrize("given", ["train", "val", "test", "train val", "train test"])
@@ -151,7 +140,7 @@ def test_one_list_is_enough(capture: Path, given: str) -> None:
 
 
 def test_reduced_photographs_of_nerfstudio(capture: Path) -> None:
-    reduce_photographs(capture, 2, (24, 18))
+    captures.reduce_photographs(capture, 2, (24, 18))
     one = load_any(capture, downscale_factor=2)
     equal(one, stock(capture, downscale_factor=2, eval_mode="interval"))
     assert one.cached_train[0]["image"].shape == (18, 24, 3)
@@ -161,7 +150,7 @@ def test_reduced_photographs_of_nerfstudio(capture: Path) -> None:
 
 
 def test_photographs_of_one_name_in_two_folders(capture: Path) -> None:
-    reduce_photographs(capture, 2, (24, 18))
+    captures.reduce_photographs(capture, 2, (24, 18))
     (capture / "images/left").mkdir()
     Image.new("RGB", (48, 36), "red").save(capture / "images/left/frame_00001.png")
     edit(capture, lambda meta: meta["frames"][1].update(file_path="images/left/frame_00001.png"))
@@ -169,12 +158,6 @@ def test_photographs_of_one_name_in_two_folders(capture: Path) -> None:
     assert manager.eval_dataset.image_filenames == [capture / "images/left/frame_00001.png"]
     with expect("images/frame_00001.png, images/left/frame_00001.png have the same names in different folders"):
         load_any(capture, downscale_factor=2)
-
-
-def test_names_that_are_held_out(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    one = load_any(capture, eval_names=("images/frame_00003.png", "frame_00005.png"))
-    assert held_out(one) == ["frame_00003.png", "frame_00005.png"]
-    assert "2 of 12 photographs, by --eval-names (frame_00003.png, frame_00005.png)" in printed(capsys)
 
 
 def test_points_of_the_model_that_a_capture_was_made_of(capture: Path) -> None:
@@ -306,7 +289,7 @@ def test_nerfstudios_parsers_are_read_by_ours(blender: Path) -> None:
     assert ngp == BitymiDataParserConfig(data=blender, format="instant-ngp", points="random")
     model = bitymi_parser(ColmapDataParserConfig(data=blender, masks_path=Path("m")))
     assert (model.format, model.masks_path, model.points) == ("colmap", Path("m"), "auto")
-    equal(load_with(blender, BlenderDataParserConfig()), load_any(blender, points="random"))
+    equal(captures.load_with(blender, BlenderDataParserConfig()), load_any(blender, points="random"))
     for kept in (
         NerfstudioDataParserConfig(mask_color=(1.0, 0.0, 0.0)),
         InstantNGPDataParserConfig(scene_scale=1.0),

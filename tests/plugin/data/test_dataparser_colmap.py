@@ -10,16 +10,8 @@ from nerfstudio.data.dataparsers.colmap_dataparser import ColmapDataParserConfig
 from PIL import Image
 
 from bitymi_ns.train.views import View
-from tests.captures import (
-    as_binary,
-    expect,
-    images_of,
-    load_any,
-    mixed_project,
-    printed,
-    reduce_photographs,
-    save_masks,
-)
+from tests import captures
+from tests.captures import as_binary, expect, images_of, load_any, printed, reduce_photographs, save_masks
 from tests.plugin.data.test_dataparser import sides
 
 LEFT = 255 * (np.arange(48) < 24)
@@ -59,7 +51,7 @@ def test_poses_and_points_are_those_of_nerfstudios_parser(
 
 @pytest.fixture
 def mixed(tmp_path: Path) -> Path:
-    return mixed_project(tmp_path)
+    return captures.mixed_project(tmp_path)
 
 
 def test_cameras_of_several_kinds_and_sizes_in_one_capture(mixed: Path, capsys: pytest.CaptureFixture[str]) -> None:

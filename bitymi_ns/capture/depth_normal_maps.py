@@ -4,6 +4,7 @@ import math
 import os
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from operator import attrgetter
 from pathlib import Path
 from typing import IO, Any
@@ -63,15 +64,11 @@ def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
 
 def _is_color(path: Path) -> bool:
     """Test for an integer image whose channels differ, which is no depth."""
-    if path.suffix.lower() not in (".png", ".tif", ".tiff"):
-        return False
-    try:
-        if math.prod(image_shape(path)) > MOST_NUMBERS:
-            return False
-        values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except Exception:  # libraries on damaged files; reported when they are read
-        return False
-    return values is not None and values.ndim == 3 and values.dtype.kind in "iu" and _channels_differ(values)
+    with suppress(Exception):  # libraries on damaged files; reported when they are read
+        if path.suffix.lower() in (".png", ".tif", ".tiff") and math.prod(image_shape(path)) <= MOST_NUMBERS:
+            values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            return values is not None and values.ndim == 3 and values.dtype.kind in "iu" and _channels_differ(values)
+    return False
 
 
 def _channels_differ(values: npt.NDArray[Any]) -> bool:

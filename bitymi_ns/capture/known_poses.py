@@ -38,8 +38,7 @@ def triangulate(
     names = [os.path.relpath(view.file, capture) for view in views]
     check_names(capture, names)
     masks = [view.mask for view in views if view.mask is not None and os.path.isfile(view.mask)]
-    inputs = list(zip(names, (view.file for view in views), strict=True))
-    inputs += [(os.path.relpath(mask, capture), mask) for mask in masks]
+    inputs = [(os.path.relpath(file, capture), file) for file in (*(view.file for view in views), *masks)]
     poses = [np.linalg.inv(view.pose @ OPENCV_AXES)[:3].tolist() for view in views]  # world to camera
     key = content_key(inputs, [(view.camera, pose) for view, pose in zip(views, poses, strict=True)])
     folder = Path(os.path.commonpath([os.path.abspath(view.file.parent) for view in views]))
@@ -80,9 +79,8 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
 
 
 def _job(stated: Sequence[str], views: Sequence[Photograph], poses: list[list[list[float]]], work: Path) -> Job:
-    links, masks = emptied(work / "links"), {}
+    links, masks, names = emptied(work / "links"), {}, {}
     groups: dict[ColmapCamera, list[str]] = defaultdict(list)
-    names = {}
     for i, (name, view) in enumerate(zip(stated, views, strict=True)):
         if from_header(view.file, lambda image, file=view.file: is_plain(image, file), False):
             plain = f"{i:06d}{view.file.suffix.lower()}"

@@ -210,9 +210,9 @@ def make_job(
 ) -> Job:
     """Make the job of these photographs in their order, linked in the work folder under plain names. `images`: folder
     of the upright photographs, `used` their names in it; in a `sequence` neighbours overlap."""
-    links = emptied(work / "links")
-    plain = {photo.name: f"{i:06d}{Path(used[photo.name]).suffix.lower()}" for i, photo in enumerate(photos)}
-    for photo in photos:
+    links, plain = emptied(work / "links"), {}
+    for i, photo in enumerate(photos):
+        plain[photo.name] = f"{i:06d}{Path(used[photo.name]).suffix.lower()}"
         (links / plain[photo.name]).symlink_to((images / used[photo.name]).resolve())
     masked = {plain[p.name]: (masks[p.name], (p.width, p.height)) for p in photos if p.name in masks}
     positions, _ = local_positions({p.name: p.exif.position for p in photos if p.exif.position is not None})
@@ -258,9 +258,8 @@ def _write(work: Path, images: Path, values: dict[str, object], photos: Sequence
     values |= {"up": frame.up, "metres_per_unit": frame.metres_per_unit, "gps_error": frame.gps_error}
     known = {job.names[plain] for group in job.cameras if group.prior for plain in group.names}
     stated = {image.camera_id for image in model.images.values() if image.name in known}  # a model's file has no priors
-    names, cameras = ("model", "width", "height", "params", "prior"), model.cameras.values()
-    rows = ((c.model_name, c.width, c.height, c.params.tolist(), c.camera_id in stated) for c in cameras)
-    values["cameras"] = [dict(zip(names, row, strict=True)) for row in rows]
+    values["cameras"] = [{"model": c.model_name, "width": c.width, "height": c.height, "params": c.params.tolist(),
+                          "prior": c.camera_id in stated} for c in model.cameras.values()]  # fmt: skip
     kept = {each.name: values[each.name] for each in fields(FoundPoses) if each.name in values}
     with complete_folder(work / "result") as result:
         sparse = result / SPARSE

@@ -63,8 +63,21 @@ class Transforms:
 
 
 def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_masks: bool = True) -> Transforms:
-    """Read a JSON file, and find its photographs, maps and masks. Raises CaptureError: the file cannot be used."""
-    meta = load_transforms(path, own_format)
+    """Read a JSON file in any Unicode encoding, check it, make poses rotations, and find its photographs, maps and
+    masks. Raises CaptureError: the file cannot be used; names the frame."""
+    if not os.path.lexists(path):
+        fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
+    with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
+        meta = read_json(path)
+        _drop_nulls(meta)
+        _check_frames(path, meta, own_format)
+        for holder in (meta, *meta["frames"]):
+            _translate(path, holder)
+        _check_applied(path, meta)
+        for key in [key for key in LISTS if key in meta]:
+            if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
+                fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it or remove it.")
+        correct_poses(path, meta["frames"])
     frames = meta["frames"]
     lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
     names = [frame["file_path"] for frame in frames]
@@ -97,25 +110,6 @@ def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_
     used = [*files, *masks, *(file for each in maps for file in astuple(each))]
     named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)
     return Transforms(path, meta, photographs, NameLists(lists), named)
-
-
-def load_transforms(path: Path, own_format: bool) -> dict[str, Any]:
-    """Load a file in any Unicode encoding, with or without byte order mark; check its frames, poses and lists of names,
-    and make poses rotations. Raises CaptureError: the file cannot be used; names the frame."""
-    if not os.path.lexists(path):
-        fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
-    with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
-        meta = read_json(path)
-        _drop_nulls(meta)
-        _check_frames(path, meta, own_format)
-        for holder in (meta, *meta["frames"]):
-            _translate(path, holder)
-        _check_applied(path, meta)
-        for key in [key for key in LISTS if key in meta]:
-            if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
-                fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it or remove it.")
-        correct_poses(path, meta["frames"])
-    return meta
 
 
 def _drop_nulls(meta: Any) -> None:

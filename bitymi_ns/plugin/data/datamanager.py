@@ -65,8 +65,7 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     """Type of the images in memory; uint8 takes a quarter of the space."""
     longest_side: int = LONGEST_SIDE
     """Downscale photographs to this many pixels along a side as they are read; 0 = use them as they are."""
-    train_cameras_sampling_seed: int = 42
-    """Seed of the order of training views."""
+    train_cameras_sampling_seed: int = 42  # Seed of the order of training views.
     # nerfstudio's options without effect here are left out of the help
     train_cameras_sampling_strategy: tyro.conf.Suppress[Literal["random", "fps"]] = "random"
     fps_reset_every: tyro.conf.Suppress[int] = 100

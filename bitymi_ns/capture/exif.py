@@ -1,13 +1,13 @@
 """Read EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, if plausible."""
 
 import math
-import struct
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from io import BytesIO
 from typing import Any
 
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, TiffImagePlugin
 
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres, of focal lengths "in 35 mm film"
 SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)  # aspect ratios of uncropped photographs
@@ -138,33 +138,25 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
     """Parse AccelerationVector (tag 8) of Apple's maker note, in g. Its axes point to the phone's left side as seen
     from its front, to its bottom, and into its face. For a phone held still it points away from the ground. The note
     has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its start."""
-    if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
-        return None
-    with suppress(struct.error, ZeroDivisionError):
-        (entries,) = struct.unpack_from(">H", note, 14)
-        for i in range(entries):
-            tag, kind, count, offset = struct.unpack_from(">HHII", note, 16 + 12 * i)
-            if (tag, kind, count) == (8, 10, 3):  # signed rationals
-                parts = struct.unpack_from(">6i", note, offset)
-                x, y, z = (parts[j] / parts[j + 1] for j in (0, 2, 4))
-                return x, y, z
+    if note.startswith(b"Apple iOS\0") and note[12:14] == b"MM":
+        with suppress(Exception):  # Pillow raises many kinds on broken EXIF
+            entries, file = TiffImagePlugin.ImageFileDirectory_v2(b"MM\0*\0\0\0\x0e"), BytesIO(note)
+            file.seek(14)
+            entries.load(file)
+            x, y, z = map(float, entries[8])
+            return x, y, z
     return None
 
 
 def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
     """Read latitude, longitude and altitude; None unless the first two are plausible."""
-    try:
+    with suppress(KeyError, TypeError, ValueError, ZeroDivisionError):
         angles = []
-        for tag, reference, limit in ((2, 1, 90), (4, 3, 180)):
+        for tag, reference in ((2, 1), (4, 3)):
             degrees, minutes, seconds = (float(part) for part in gps[tag])
             angle = degrees + minutes / 60 + seconds / 3600
-            if not angle <= limit:
-                return None
             angles.append(-angle if str(gps.get(reference, "")).strip("\0 ").upper() in ("S", "W") else angle)
-        height = float(gps.get(6, 0.0))
-        below = gps.get(5) in (1, b"\x01")
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        return None
-    if angles == [0.0, 0.0] or not math.isfinite(height):
-        return None
-    return angles[0], angles[1], -height if below else height
+        height = float(gps.get(6, 0.0)) * (-1 if gps.get(5) in (1, b"\x01") else 1)
+        if abs(angles[0]) <= 90 and abs(angles[1]) <= 180 and any(angles) and math.isfinite(height):
+            return angles[0], angles[1], height
+    return None

@@ -129,17 +129,12 @@ def sample_colors(
     xyz: npt.NDArray[np.float64], photograph: Photograph, image: npt.NDArray[np.uint8]
 ) -> npt.NDArray[np.float32]:
     """Look up colors [N, 3] of points [N, 3] in an image [H, W, 3]; NaN outside."""
-    camera = photograph.camera
-    colors = np.full((len(xyz), 3), np.nan, np.float32)
+    camera, (height, width) = photograph.camera, image.shape[:2]
     local = (xyz - photograph.pose[:3, 3]) @ photograph.pose[:3, :3] * [1.0, -1.0, -1.0]
-    lens = camera.colmap
-    front = np.flatnonzero(lens.is_spherical() | (local[:, 2] > 0.0))
-    if not len(front):
-        return colors
-    pixels = lens.img_from_cam(local[front] / np.abs(local[front, 2:]).clip(min=1e-12))
-    height, width = image.shape[:2]
+    pixels = camera.pixels_of(local / np.abs(local[:, 2:]).clip(min=1e-12))  # NaN behind the camera
     pixels = np.nan_to_num(pixels * np.divide((width, height), camera.size), nan=-1.0, posinf=-1.0, neginf=-1.0)
     inside = ((pixels >= 0.0) & (pixels < (width, height))).all(1)
     x, y = pixels[inside].astype(int).T
-    colors[front[inside]] = image[y, x]
+    colors = np.full((len(xyz), 3), np.nan, np.float32)
+    colors[inside] = image[y, x]
     return colors

@@ -117,16 +117,6 @@ class CaptureOptions(SplitOptions, FrameOptions):
                 fail(f"--{name.replace('_', '-')} is not for {read_as}. Leave it out, or give --format.")
         return found
 
-    def source(self, found: Found, need_photos: bool = True) -> Source:
-        """Find the COLMAP model and its photographs; photographs without poses go through structure from motion."""
-        if found.format == "colmap":
-            return find_source(found, self.images_path, self.downscale_factor or 1, need_photos)
-        if (kept := read_kept_poses(self.poses)) is not None:
-            return kept_source(found, kept, need_photos)
-        if self.poses is not None:
-            warn(f"The poses that the run was trained with are no longer in {self.poses}: others can be found now.")
-        return find_sfm_source(found, self.masks_path, self.sfm, self.use_masks)
-
 
 @dataclass
 class Capture:
@@ -238,9 +228,16 @@ class _Reader:
         return Capture(found.format, source, photographs, points, frame, read.lists, **of_file)
 
     def _colmap(self) -> Capture:
-        """Read a COLMAP model, and the lists of names beside it."""
+        """Read a COLMAP model, of photographs without poses by structure from motion, and lists of names beside it."""
         options, found, need_photos = self.options, self.found, self.need_photos
-        source = options.source(found, need_photos)
+        if found.format == "colmap":
+            source = find_source(found, options.images_path, self.downscale, need_photos)
+        elif (kept := read_kept_poses(options.poses)) is not None:
+            source = kept_source(found, kept, need_photos)
+        else:
+            if gone := options.poses:
+                warn(f"The poses that the run was trained with are no longer in {gone}: others can be found now.")
+            source = find_sfm_source(found, options.masks_path, options.sfm, options.use_masks)
         model = source.model
         named = warn_left_out(source) if need_photos else set()
         photographs, where = photographs_of(source), str(source.folder)

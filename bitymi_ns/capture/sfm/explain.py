@@ -8,6 +8,7 @@ import numpy as np
 from scipy.cluster.hierarchy import DisjointSet
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.sfm.job import MAX_ERROR, CameraGroup, Job, NoPoses
@@ -149,9 +150,8 @@ def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
     """Measure distances [n] in pixels of unit rays a, b [n, 3] after the best rotation; `focal`: pixels per radian."""
     keep = np.ones(len(a), bool)
     for _ in range(3):  # least squares, then without the worst half, which has the wrong matches
-        u, _, vt = np.linalg.svd(b[keep].T @ a[keep])
-        turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-        distances = np.linalg.norm(a @ turn.T - b, axis=1) * focal
+        turn, _ = Rotation.align_vectors(b[keep], a[keep])
+        distances = np.linalg.norm(turn.apply(a) - b, axis=1) * focal
         keep = distances <= np.median(distances)
     return distances
 

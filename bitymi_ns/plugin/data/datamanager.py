@@ -96,16 +96,14 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
             self._check_points()
         outputs, dataset = self.train_dataparser_outputs, self.train_dataset
         cameras, color, files = outputs.cameras, outputs.alpha_color, dataset.facts.files
+        # photographs may be missing unless a run trains
+        sampled = spread(len(files), ALPHA_SAMPLES) if self._has_photos(test_mode) else ()
+        declare_alpha = (i for i in sampled if image_files.file_has_transparency(files[i]))
         dataset.metadata[KEY] = replace(
             dataset.facts,
             alpha_color=None if color is None else torch.as_tensor(color).float(),
             has_alpha=bool(files) and image_files.file_has_transparency(files[0]),
-            # photographs may be missing unless a run trains
-            transparent=self._has_photos(test_mode)
-            and any(
-                image_files.file_has_transparency(files[i]) and dataset.get_numpy_image(i).shape[-1] == 4
-                for i in spread(len(files), ALPHA_SAMPLES)
-            ),
+            transparent=any(dataset.get_numpy_image(i).shape[-1] == 4 for i in declare_alpha),
             declares_box=dataset.facts.declares_box or declares_box(config.dataparser),
             train_pixels=int((cameras.width.long() * cameras.height.long()).sum()),
             camera_centers=cameras.camera_to_worlds[..., :3, 3].reshape(-1, 3),

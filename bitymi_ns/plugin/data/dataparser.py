@@ -131,8 +131,7 @@ class BundleCameras(DataParser):
         names, poses, pinholes = [files[row.name] for row in chosen], [], []
         for camera in (row.camera for row in chosen):
             poses.append((torch.linalg.inv(camera.viewmat.double()) @ torch.from_numpy(OPENCV_AXES)).float())
-            K = camera.K.tolist()
-            pinholes.append(Pinhole(K[0][0], K[1][1], K[0][2], K[1][2], camera.width, camera.height))
+            pinholes.append(Pinhole(*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), camera.width, camera.height))
         return Views(
             image_filenames=names,
             cameras=pinhole_cameras(pinholes, torch.stack(poses)),

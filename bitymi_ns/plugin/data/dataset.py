@@ -88,16 +88,14 @@ class BitymiDataset(InputDataset):
         """Read an image [H, W, 3 or 4], alpha not composed, its mask [H, W, 1] bool if any, and in training its depth
         [H, W] in units of the scene and normal [H, W, 3], both float16, if they are used."""
         image = torch.from_numpy(self.get_numpy_image(image_idx))
+        image = image.float() / 255.0 if image_type == "float32" else image
         data: dict[str, Any] = {"image_idx": image_idx, "image": image}
-        if image_type == "float32":
-            data["image"] = image.float() / 255.0
         masks = self._dataparser_outputs.mask_filenames
         if masks is not None or not (self.facts.lost or self.facts.lenses[image_idx].whole):
-            mask = view_mask(self._dataparser_outputs, image_idx)
-            mask = self._scaled(mask, Image.Resampling.NEAREST)
+            mask = self._scaled(view_mask(self._dataparser_outputs, image_idx), Image.Resampling.NEAREST)
             data["mask"] = torch.from_numpy(np.array(mask, dtype=bool))[..., None]
             if self.mask_color:
-                fill, image = torch.tensor(self.mask_color), data["image"]
+                fill = torch.tensor(self.mask_color)
                 if not image.is_floating_point():
                     fill = fill.mul(255.0).round().to(image.dtype)
                 colors = torch.where(data["mask"], image[..., :3], fill)
@@ -160,11 +158,11 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
     blank = [i for i, box in enumerate(boxes) if box is None]
     if not blank:
         return outputs
-    which = f"of {len(masks)} {split} photographs exclude every pixel"
+    which = f"{len(masks)} {split} photographs exclude every pixel"
     named = listed([outputs.image_filenames[i] for i in blank])
     if split == "training" and len(blank) == len(masks):
-        fail(f"the masks {which}: {named}. Pixels count where the mask is not black: invert inverted masks.")
-    warn(f"The masks of {len(blank)} {which}: {named}. These views are left out.")
+        fail(f"the masks of all {which}: {named}. Pixels count where the mask is not black: invert inverted masks.")
+    warn(f"The masks of {len(blank)} of {which}: {named}. These views are left out.")
     return select_views(outputs, [i for i in range(len(masks)) if i not in blank])
 
 

@@ -136,18 +136,16 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> S
         if kind == "relative":
             warn("Relative depth needs points of the scene, and there are none in the pictures: depth is not used.")
             return None
-        fit = DepthFit(unit)
-        agreement = _agreement([each.fitted(fit) for each in seen])
+        agreement = _agreement([view.fitted(DepthFit(unit)) for view in seen])
         if agreement is not None and agreement < AGREE_MUTUALLY:
             what = f"The depth maps agree with each other in {agreement:.0%} of their pixels by the poses"
             warn(f"{what}: depth is not used. Its unit may be another (`bitymi-data --depth-unit-scale-factor`).")
             return None
         say(f"Depth of {len(seen)} photographs is used as metric.")
-        return [fit] * len(seen)
+        return [DepthFit(unit)] * len(seen)
     scale = _mode(z / values)
-    metric = float((np.abs(scale * values / z - 1.0) < TOLERANCE).mean())
+    metric, share = float((np.abs(scale * values / z - 1.0) < TOLERANCE).mean()), 0.0
     relative: list[DepthFit | None] = []
-    share = 0.0
     if kind != "metric":
         for inverse in (False, True):
             fits = [_affine(*pair, inverse) for pair in pairs]

@@ -163,16 +163,14 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
         fail(f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 for no limit.")
     facts = CaptureFacts.of(outputs.metadata)
     lenses = facts.lenses
-    sizes = [(lens.pinhole.width, lens.pinhole.height) for lens in lenses]
-    large = [size for size in sizes if longest and max(size) > longest]
+    large = [lens.pinhole[4:] for lens in lenses if longest and max(lens.pinhole[4:]) > longest]
     if not large:
         return outputs
-    sized = dict(zip(lenses, sizes, strict=True))
-    small = {lens: lens.downscaled(min(1.0, longest / max(size))) for lens, size in sized.items()}
+    small = {lens: lens.downscaled(min(1.0, longest / max(lens.pinhole[4:]))) for lens in set(lenses)}
     lenses = [small[lens] for lens in lenses]
     if verbose:
         width, height = max(large, key=max)
-        which = f"{len(large)} of {len(sizes)} training photographs have more than {longest} pixels along a side"
+        which = f"{len(large)} of {len(lenses)} training photographs have more than {longest} pixels along a side"
         how = "--pipeline.datamanager.longest-side 0 uses them as they are"
         say(f"{which} (up to {width} x {height}): they are reduced. {how}.")
     cameras = pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds)

@@ -131,7 +131,8 @@ class BundleCameras(DataParser):
         names, poses, pinholes = [files[row.name] for row in chosen], [], []
         for camera in (row.camera for row in chosen):
             poses.append((torch.linalg.inv(camera.viewmat.double()) @ torch.from_numpy(OPENCV_AXES)).float())
-            pinholes.append(Pinhole(*camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist(), camera.width, camera.height))
+            fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+            pinholes.append(Pinhole(fx, fy, cx, cy, camera.width, camera.height))
         return Views(
             image_filenames=names,
             cameras=pinhole_cameras(pinholes, torch.stack(poses)),

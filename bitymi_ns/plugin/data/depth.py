@@ -98,10 +98,9 @@ def _check_normals(facts: CaptureFacts) -> None:
     for i in [rows[k] for k in spread(len(rows), 8)]:
         lens, files = facts.lenses[i], facts.maps[i]
         normal = read_normal(files, lens)
-        away = (normal * lens.pinhole.rays).sum(-1) > 0.0
-        known = normal.any(-1)
-        if known.any() and away[known].mean() > 0.2:
-            what = f"{away[known].mean():.0%} of the normals of {files.normal} face away from the camera"
+        away = ((normal * lens.pinhole.rays).sum(-1) > 0.0)[normal.any(-1)]
+        if len(away) and away.mean() > 0.2:
+            what = f"{away.mean():.0%} of the normals of {files.normal} face away from the camera"
             frame = "they are not in its frame (x right, y up, z back)"
             warn(f"{what}: {frame}. Correct them, or train without: `bitymi-data --depth off`.")
             return

@@ -40,14 +40,8 @@ class Step:
 
 
 def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (), length: int = 30_000) -> list[Step]:
-    """Build the steps of an order. `frames` draws the bundles of `train`.
-
-    Args:
-        results: folder of the tables.
-        data: folder of captures.
-        surfels: numbers of surfels of the synthetic scenes.
-        length: steps of the runs of `train`.
-    """
+    """Build the steps of an order, with tables in `results`. `frames` draws scenes of `surfels` surfels and the bundles
+    of `train`, which trains on the captures in `data` for `length` steps."""
     times = (sys.executable, "benchmarks/times.py")
     pytest = (sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "-o", "faulthandler_timeout=60")
     sanitizer = ("compute-sanitizer", "--error-exitcode", "9", "--print-limit", "20", "--tool")

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +38,7 @@ def trained_like(n: int, width: int, height: int, device: torch.device, texture:
     view; a share `CROSSING` are discs beside the camera that cross its plane.
     """
     g = torch.Generator().manual_seed(0)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g)
-
-    def uniform(*shape: int) -> Tensor:
-        return torch.rand(*shape, generator=g)
-
+    normal, uniform = partial(torch.randn, generator=g), partial(torch.rand, generator=g)
     focal = 0.9 * width
     K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
     z = 2.0 * torch.exp(1.4 * uniform(n))  # 2 to 8

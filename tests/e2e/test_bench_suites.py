@@ -1,15 +1,14 @@
 """Command lines of `bitymi bench` work with nerfstudio: standard layouts, seeds, own captures."""
 
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
-from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.measure.bench.engine import CURVE, train_command
 from bitymi_ns.measure.bench.matrix import Cell, standard_scenes
+from bitymi_ns.measure.bench.process import run_measured
 from bitymi_ns.measure.report.read import read_jsonl
 from tests.captures import colmap_model
 
@@ -26,21 +25,15 @@ def colmap_scene(room: Path, folder: Path) -> None:
     shutil.copytree(room / "images", folder / "images_2")
 
 
-def train(work: Path, run: Cell, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Run a training command in this process; returns its config.yml."""
-    monkeypatch.setattr(sys, "argv", train_command(work, run))
-    ns_train.entrypoint()
-    return work / run.output / "config.yml"
-
-
-def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow
+def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path) -> None:
     colmap_scene(room, tmp_path / "360" / "bonsai")
     (scene,) = standard_scenes("mipnerf360", tmp_path / "360", ["bonsai"])
-    run = Cell(**vars(scene), method="bitymi", options=SMALL, seed=3, steps=2)
-    path = train(tmp_path / "work", run, monkeypatch)
-    (curve,) = read_jsonl(path.with_name(CURVE)).curves
+    run, work = Cell(**vars(scene), method="bitymi", options=SMALL, seed=3, steps=2), tmp_path / "work"
+    run_measured(train_command(work, run), tmp_path / "log")  # its end is in the message if it fails
+    (curve,) = read_jsonl(work / run.output / CURVE).curves
     assert curve.scene == "bonsai"
-    config, pipeline, _, _ = eval_setup(path, test_mode="test")
+    config, pipeline, _, _ = eval_setup(work / run.output / "config.yml", test_mode="test")
     assert config.machine.seed == config.pipeline.model.train.seed == 3
     assert config.pipeline.datamanager.train_cameras_sampling_seed == 3
     held_out = [name.name for name in pipeline.datamanager.eval_dataset.image_filenames]

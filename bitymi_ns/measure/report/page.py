@@ -42,12 +42,11 @@ def to_page(content: dict[str, Any]) -> str:
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
-    """Write a report as a self-contained index.html and return its path.
+    """Write a report as a self-contained index.html, which replaces an earlier one, and return its path.
 
     Args:
         inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
             `fragments`, `psnr`), cells of `bitymi bench`, PNG images of ns-eval, and folders to search for these.
-        output_dir: folder of the report, created if needed; an earlier report is replaced.
 
     Raises:
         ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.

@@ -60,16 +60,14 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
     with reading(f"{path}: a cell", _refuse, passing=(ReportError,)):
         runs = grouped(cells, lambda cell: identity(cell["key"], *NOT_OF_A_RUN))
         keys = [of_run[0]["key"] for of_run in runs.values()]
-        series = [identity(key, *NOT_OF_A_RUN, "seed") for key in keys]
-        seeds = Counter(series)
-        names = [(str(key.get("scene", "unnamed scene")), str(key.get("row", "unnamed method"))) for key in keys]
-        namesakes = Counter((*name, key.get("seed")) for name, key in zip(names, keys, strict=True))
-        for of_run, key, of_seeds, (scene, name) in zip(runs.values(), keys, series, names, strict=True):
-            seed, steps = key.get("seed"), key.get("steps")
-            if namesakes[scene, name, seed] > 1:  # runs that differ in their length
-                name += f", {steps:,} steps" if isinstance(steps, int) else ", own length"
-            suffix = f", seed {seed}" if seeds[of_seeds] > 1 and seed is not None else ""
-            trained = Evaluation(scene, name, False, name + suffix, {}, path, name, of_seeds)
+        seeds = Counter(identity(key, *NOT_OF_A_RUN, "seed") for key in keys)
+        namesakes = Counter((key["scene"], key["row"], key.get("seed")) for key in keys)
+        for of_run, key in zip(runs.values(), keys, strict=True):
+            name, seed, series = str(key["row"]), key.get("seed"), identity(key, *NOT_OF_A_RUN, "seed")
+            if namesakes[key["scene"], key["row"], seed] > 1:  # runs that differ in their length
+                name += f", {key['steps']:,} steps" if key["steps"] else ", own length"
+            suffix = f", seed {seed}" if seeds[series] > 1 and seed is not None else ""
+            trained = Evaluation(str(key["scene"]), name, False, name + suffix, {}, path, name, series)
             _add_run(trained, suffix, of_run, records)
 
 
@@ -109,8 +107,8 @@ def _add_run(trained: Evaluation, suffix: str, of_run: list[dict[str, Any]], rec
 
 
 def _walk(folder: Path, skip: Path) -> Iterator[Path]:
-    """List the files below `folder` that may be inputs, sorted, without hidden folders, links to folders, and `skip`;
-    of a benchmark's work folder only its cells, which name all other files."""
+    """List the files below a folder that may be inputs, without hidden folders and `skip`; of a benchmark's work folder
+    only its cells, which name all other files."""
     for root, folders, files in os.walk(folder):
         here = Path(root)
         if CELLS in files:
@@ -139,15 +137,8 @@ def _read(path: Path) -> Records:
 
 
 def collect(inputs: list[Path], output_dir: Path) -> Records:
-    """Read all inputs.
-
-    Args:
-        inputs: files, and folders to search for files.
-        output_dir: folder of the report, which is not searched.
-
-    Raises:
-        ReportError: a named file is missing, broken, or of an unknown kind; or nothing usable was found.
-    """
+    """Read all inputs: files, and folders to search for files, except that of the report. Raises ReportError: a named
+    file is missing, broken, or of an unknown kind; or nothing usable was found."""
     records, seen = Records(), set()
     # named files first: their errors are fatal, also if a folder contains the same file
     paths = [Path(os.path.expanduser(p)) for p in inputs]

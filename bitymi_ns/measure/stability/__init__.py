@@ -1,1 +1,1 @@
-"""Float32 errors on extreme scenes against float64 and extended precision, and the page that lists them."""
+"""Float32 errors on extreme scenes against float64, and the page that lists them."""

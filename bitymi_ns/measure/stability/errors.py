@@ -96,32 +96,30 @@ class Errors(NamedTuple):
 
 class _Result(NamedTuple):
     images: dict[str, Tensor]  # [P, C] each, with autograd graph
-    blended: Tensor  # [P, N] bool
-    low_pass: Tensor  # [P, N] bool
-    cells: Tensor  # [P, N] int64; 0 without texels
+    terms: Tensor  # [P, N] int64, see `_terms`; 0: the surfel is not blended
     leaves: dict[str, Tensor]
+
+
+def _terms(uv: Tensor, low_pass: Tensor, textured: bool) -> Tensor:
+    """Number what fragments add, by branch of the kernel and cell between texels; -1 where rounding decides."""
+    between = cells(uv) if textured else torch.zeros_like(low_pass, dtype=torch.int64)
+    return torch.where(between < 0, -1, 1 + 2 * between + low_pass)
 
 
 def _same(got: _Result, want: _Result) -> Tensor:
     """Find the pixels, [P] bool, in which both sum the same terms."""
-    alike = (got.low_pass == want.low_pass) & (got.cells == want.cells) & (got.cells >= 0)
-    return ((got.blended == want.blended) & (alike | ~want.blended)).all(1)
+    return ((got.terms == want.terms) & (got.terms >= 0)).all(1)
 
 
 def measure(
     case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float32, near: float = 0.2, way: Way = PLAIN
 ) -> Errors:
-    """Render and differentiate a case with a backend and with the reference, from inputs rounded to `dtype`.
-
-    Args:
-        case: scene and camera, float64.
-        near: near plane, camera z.
-        way: rendering mode.
-    """
+    """Render and differentiate a case with a backend and with the reference, from inputs rounded to `dtype`. `near`:
+    near plane, camera z."""
     rounded = _map(way.of(case), lambda t: t.to(dtype).double())
     with backend.use():
-        got = _by_kernels(rounded, backend.device, dtype, near, way)
-        want = _by_reference(rounded, near, way)
+        got = _by_kernels(rounded, backend.device, dtype, near)
+        want = _by_reference(rounded, near)
         same = _same(got, want)
         weights = _loss_weights(want.images)
         grads = _gradients(got, weights, same)
@@ -138,7 +136,7 @@ def measure(
 
     for _ in range(PROBES):
         moved = _map(rounded, probe)
-        other = _by_reference(moved, near, way)
+        other = _by_reference(moved, near)
         agree = _same(other, want)
         input_forward = max(input_forward, _image_error(other.images, want.images, agree))
         here, there = (_gradients(result, weights, agree & same) for result in (want, other))
@@ -150,7 +148,7 @@ def measure(
         input_gradient=input_gradient,
         worst=worst,
         flipped=1.0 - same.double().mean().item(),
-        drawn=int(want.blended.sum()),
+        drawn=int((want.terms != 0).sum()),
         finite=all(bool(t.isfinite().all()) for t in (*got.images.values(), *grads.values(), *everywhere.values())),
     )
 
@@ -160,39 +158,33 @@ def _map(case: SceneCase, function) -> SceneCase:
     return replace(case, params=params, viewmat=function(case.viewmat), K=function(case.K))
 
 
-def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float, way: Way) -> _Result:
+def _by_kernels(case: SceneCase, device: str, dtype: torch.dtype, near: float) -> _Result:
     leaves = {key: value.to(device, dtype).clone().requires_grad_() for key, value in case.params.items()}
     camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
-    alpha = ops.TexelAlpha(tiles_of(leaves[TEXELS]), leaves[ALPHAS].squeeze(1), 0.0) if way.alpha else None
+    textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if TEXELS in leaves else {}
+    alpha = ops.TexelAlpha(textured["tiles"], leaves[ALPHAS].squeeze(1), 0.0) if ALPHAS in leaves else None
     projection = ops.project(*geometry_of(leaves), camera=camera, near=near, alpha=alpha)
     fragments = ops.trace(projection, RIM)
     base = ops.view_color("sv", leaves, leaves["means"], camera.exact_center, projection.visible)
-    textured = {"texels": leaves[TEXELS], "tiles": tiles_of(leaves[TEXELS])} if way.texels else {}
     image = ops.blended_image(fragments, projection, base, **textured, maps=True)
-    shape = (case.width * case.height, len(leaves["means"]))
-    blended, low_pass = torch.zeros(shape, dtype=torch.bool), torch.zeros(shape, dtype=torch.bool)
-    pixel, surfel = fragments.pixel.cpu().long(), fragments.surfel.cpu().long()
-    blended[pixel, surfel] = True
-    low_pass[pixel, surfel] = fragments.sigma.cpu() < 0
-    between = torch.zeros(shape, dtype=torch.int64)
-    if way.texels:
-        between[pixel, surfel] = cells(fragments.uv.T).cpu()
+    terms = torch.zeros(case.width * case.height, len(leaves["means"]), dtype=torch.int64)
+    numbers = _terms(fragments.uv.T, fragments.sigma < 0, TEXELS in leaves)
+    terms[fragments.pixel.cpu().long(), fragments.surfel.cpu().long()] = numbers.cpu()
     parts = dict(zip(SIZES, image.split(list(SIZES.values()), dim=1), strict=True))
-    return _Result({key: parts[key] for key in IMAGES}, blended, low_pass, between, leaves)
+    return _Result({key: parts[key] for key in IMAGES}, terms, leaves)
 
 
-def _by_reference(case: SceneCase, near: float, way: Way) -> _Result:
+def _by_reference(case: SceneCase, near: float) -> _Result:
     leaves = {key: value.clone().requires_grad_() for key, value in case.params.items()}
     directions = view_directions(leaves["means"], case.viewmat)
     colors = reference_view_color.sv(*(leaves[key] for key in SV_KEYS), dirs=directions)
-    geometry = geometry_of(leaves)
     texels = [leaves[key] for key in (TEXELS, ALPHAS) if key in leaves]
     tiles = tile_images(torch.cat(texels, 1)) if texels else None
-    result = reference_render.render(geometry, colors, case, tiles=tiles, near=near, rim=RIM)
+    result = reference_render.render(geometry_of(leaves), colors, case, tiles=tiles, near=near, rim=RIM)
     images = {key: getattr(result, key).reshape(case.width * case.height, -1) for key in IMAGES}
     trace = result.trace
-    between = cells(trace.uv) if way.texels else torch.zeros_like(trace.blended, dtype=torch.int64)
-    return _Result(images, trace.blended, trace.low_pass, between, leaves)
+    terms = torch.where(trace.blended, _terms(trace.uv, trace.low_pass, TEXELS in leaves), 0)
+    return _Result(images, terms, leaves)
 
 
 def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:

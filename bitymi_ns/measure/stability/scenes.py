@@ -4,6 +4,7 @@ stiffness."""
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -35,20 +36,15 @@ def random_scene(
 ) -> SceneCase:
     """Generate n surfels of about `scale` units at depths 2 to 6 before a camera with an oblique pose and fx != fy."""
     g = torch.Generator().manual_seed(seed)
-
-    def normal(*shape: int) -> Tensor:
-        return torch.randn(*shape, generator=g, dtype=torch.float64)
-
-    def uniform(low: float, high: float, *shape: int) -> Tensor:
-        return low + (high - low) * torch.rand(*shape, generator=g, dtype=torch.float64)
-
+    normal = partial(torch.randn, generator=g, dtype=torch.float64)
+    uniform = partial(torch.rand, generator=g, dtype=torch.float64)
     axes = torch.linalg.qr(normal(3, 3)).Q
     viewmat = torch.eye(4, dtype=torch.float64)
     viewmat[:3, :3] = axes * torch.sign(torch.linalg.det(axes))
     viewmat[:3, 3] = normal(3)
     K = torch.tensor([[1.1 * width, 0, 0.52 * width], [0, 1.0 * width, 0.47 * height], [0, 0, 1]], dtype=torch.float64)
-    depth = uniform(2, 6, n)
-    pixel = torch.stack([uniform(0, width, n), uniform(0, height, n), torch.ones(n, dtype=torch.float64)], dim=-1)
+    depth = 2 + 4 * uniform(n)
+    pixel = torch.stack([width * uniform(n), height * uniform(n), torch.ones(n, dtype=torch.float64)], dim=-1)
     camera = pixel @ torch.linalg.inv(K).T * depth[:, None]
     params = {
         "means": (camera - viewmat[:3, 3]) @ viewmat[:3, :3],

@@ -129,9 +129,10 @@ def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
     ("line", "reason"),
     [
         ("{}", "line 2, is not a finished cell"),
-        ('{"key": {"cell": "eval"}, "value": {}}', "the eval cell of .* the entry 'results' is missing"),
+        ('{"key": {"cell": "eval"}, "value": {}}', "the entry 'scene' is missing"),
+        ('{"key": {"cell": "eval", "scene": "a", "row": "b"}, "value": {}}', "the entry 'results' is missing"),
         (
-            '{"key": {"cell": "eval", "scene": ["a"]}, "made": "x", "value": {"results": {"psnr": "bad"}}}',
+            '{"key": {"cell": "eval", "scene": 3, "row": ""}, "made": "x", "value": {"results": {"psnr": "bad"}}}',
             "the entry 'psnr' is missing",
         ),
     ],

@@ -1,12 +1,13 @@
 """Run every test on the CUDA kernels: emulated on the host, and on a GPU if there is one."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from typing import TypeVar
 
 import pytest
 import torch
 
-from bitymi_ns.ops import backend
+from bitymi_ns.ops import backend, trace_cuda
 from bitymi_ns.ops.backend import emulated_cuda
 from tests.required import REQUIRED, skip_without
 
@@ -31,6 +32,8 @@ def why_not_emulated() -> str | None:
     return None
 
 
+HERE = torch.device("cpu")
+T = TypeVar("T")
 CARD = ["card"] if torch.cuda.is_available() or "card" in REQUIRED else []
 
 
@@ -60,6 +63,40 @@ def cpu():
             backend._emulated = before
 
     return context
+
+
+@pytest.fixture
+def both(device: torch.device, cpu):
+    """Return a function that calls another for `device`, then for the CPU and its kernels."""
+
+    def call(of: Callable[[torch.device], T]) -> tuple[T, T]:
+        got = of(device)
+        with cpu():
+            return got, of(HERE)
+
+    return call
+
+
+def in_orders(device: torch.device, of: Callable[[], T], count: int = 4) -> list[T]:
+    """Call a function several times, in emulation with another order of threads each time."""
+    results = []
+    for seed in range(count):
+        with emulated_cuda(seed) if device == HERE else nullcontext():
+            results.append(of())
+    return results
+
+
+def only_short_lists(monkeypatch: pytest.MonkeyPatch, fit: int, capacity: int) -> None:
+    """Let lists longer than `fit` find no memory, although there seems to be room for `capacity` fragments."""
+    empty_list = trace_cuda.empty_list
+
+    def short_ones(geom: torch.Tensor, count: int) -> dict[str, torch.Tensor]:
+        if count > fit:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return empty_list(geom, count)
+
+    monkeypatch.setattr(trace_cuda, "empty_list", short_ones)
+    monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: capacity)
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.ops import baked_cuda
-from bitymi_ns.ops.backend import emulated_cuda, module
+from bitymi_ns.ops.backend import module
 from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cuda import Sheet, draws_blocks
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
@@ -40,6 +40,7 @@ from tests.cuda.baked_scenes import (
     textured,
     to_average,
 )
+from tests.cuda.conftest import in_orders
 from tests.ops.golden import SceneCase, atlas_of, extreme_scenes, load_golden, random_scene
 from tests.ops.test_view_color import lean_parameters
 
@@ -213,13 +214,10 @@ def test_the_order_of_threads_changes_nothing(device: torch.device) -> None:
     if device.type == "cuda":
         pytest.skip("the emulation sets the order")
     scene, camera = textured(50, 3), front(40, 40)
-    images = []
-    for seed in range(5):
-        with emulated_cuda(seed):
-            images.append(scene.render(camera, maps=True))
-    for other in images[1:]:
+    first, *others = in_orders(device, lambda: scene.render(camera, maps=True), 5)
+    for other in others:
         for name in FIELDS:
-            assert torch.equal(getattr(other, name), getattr(images[0], name)), name
+            assert torch.equal(getattr(other, name), getattr(first, name)), name
 
 
 def test_views_drawn_together(device: torch.device) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from bitymi_ns import ops
-from bitymi_ns.ops import trace_cuda
+from tests.cuda.conftest import only_short_lists
 from tests.scene import bands
 
 pytestmark = pytest.mark.slow
@@ -20,18 +20,10 @@ def test_values_and_gradients_do_not_change(device: torch.device) -> None:
 @pytest.mark.parametrize("fit", [1000, 500])
 def test_lists_that_find_no_memory(device: torch.device, fit: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bands of up to `fit` fragments can be drawn; a row of tiles with more raises an error that says so."""
-    empty_list = trace_cuda.empty_list
-
-    def small_ones(geom: torch.Tensor, count: int) -> dict[str, torch.Tensor]:
-        if count > fit:
-            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-        return empty_list(geom, count)
-
     scene, camera = bands.make(device, 0)
     want = scene.render(camera)
     assert want.fragments.layout.handle.pairs < 500
-    monkeypatch.setattr(trace_cuda, "empty_list", small_ones)
-    monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: 2 * fit)
+    only_short_lists(monkeypatch, fit, 2 * fit)
     if fit == 500:
         with pytest.raises(ops.TooManyFragments, match=r"the view has [\d,]+ fragments.*, and there is room for 1,000"):
             scene.render(camera)

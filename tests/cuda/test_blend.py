@@ -1,22 +1,16 @@
 """Shading and blending in one pass on CUDA, against the CPU, in any thread order."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
-
 import pytest
 import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.ops.backend import emulated_cuda
+from tests.cuda.conftest import in_orders
 from tests.ops.golden import SceneCase, extreme_scenes, random_scene
 from tests.ops.test_blend import View
 from tests.ops.test_kernels import relative
 
 pytestmark = pytest.mark.slow
-
-Context = Callable[[], AbstractContextManager[None]]
-HERE = torch.device("cpu")
 
 
 def run(
@@ -32,13 +26,12 @@ def run(
 @pytest.mark.parametrize("maps", [False, True], ids=["image", "maps"])
 @pytest.mark.parametrize("textured, moves", [(False, True), (True, True), (True, False)])
 def test_pictures_and_gradients_are_those_of_the_cpu(
-    textured: bool, moves: bool, maps: bool, dtype: torch.dtype, device: torch.device, cpu: Context
+    textured: bool, moves: bool, maps: bool, dtype: torch.dtype, cpu, both
 ) -> None:
     """Tiles with more fragments than shared memory holds and more than 32 surfels; the image ends within one."""
     case = random_scene(150, 3, width=70, height=40)
-    got = run(case, device, dtype, textured, maps, moves)
+    got, want = both(lambda where: run(case, where, dtype, textured, maps, moves))
     with cpu():
-        want = run(case, HERE, dtype, textured, maps, moves)
         fragments, _ = View(case, dtype, textured).fragments()
     assert fragments.layout.arrays["tile_start"].diff().max() > 2048
     for mine, cpus in zip(got, want, strict=True):
@@ -72,11 +65,10 @@ def moved(case: SceneCase, device: torch.device, dtype: torch.dtype) -> list[Ten
     return [t.detach().cpu() for t in (view.given["texels"], *gradients)]
 
 
-def test_a_descent_moves_the_texels_as_on_the_cpu(device: torch.device, cpu: Context) -> None:
+def test_a_descent_moves_the_texels_as_on_the_cpu(both) -> None:
     case = random_scene(60, 3, width=70, height=40)
-    got = moved(case, device, torch.float64)
-    with cpu():
-        want, before = moved(case, HERE, torch.float64), View(case, torch.float64, True).given["texels"]
+    got, want = both(lambda where: moved(case, where, torch.float64))
+    before = View(case, torch.float64, True).given["texels"]
     assert not torch.equal(want[0], before)
     assert all(relative(mine, cpus) < 1e-10 for mine, cpus in zip(got, want, strict=True))
 
@@ -84,15 +76,9 @@ def test_a_descent_moves_the_texels_as_on_the_cpu(device: torch.device, cpu: Con
 def test_only_sums_of_texels_depend_on_the_order_of_threads(device: torch.device, exactly) -> None:
     """And not even they with deterministic algorithms."""
     case = random_scene(60, 3, width=70, height=40)
-    with_seed = [emulated_cuda(seed) if device == HERE else nullcontext() for seed in range(4)]
-    exact, plain = [], []
-    for order in with_seed:
-        with order:
-            torch.use_deterministic_algorithms(True)
-            exact.append([*run(case, device, torch.float32, True), *moved(case, device, torch.float32)])
-            torch.use_deterministic_algorithms(False)
-            plain.append(run(case, device, torch.float32, True)[:-1])
-    for runs in (exact, plain):
+    exact = in_orders(device, lambda: [*run(case, device, torch.float32, True), *moved(case, device, torch.float32)])
+    torch.use_deterministic_algorithms(False)
+    for runs in (exact, in_orders(device, lambda: run(case, device, torch.float32, True)[:-1])):
         assert all(torch.equal(a, b) for other in runs[1:] for a, b in zip(runs[0], other, strict=True))
 
 

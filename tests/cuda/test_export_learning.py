@@ -1,7 +1,6 @@
 """Optimisation during an export on the scene's device: coverage, rate-distortion search, polish, fine-tuning."""
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 
 import pytest
 import torch
@@ -18,7 +17,6 @@ from tests.cuda.test_texel_training import HERE, START, config, scene_and_views
 
 pytestmark = pytest.mark.slow
 
-Context = Callable[[], AbstractContextManager[None]]
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
 
 
@@ -61,7 +59,7 @@ def db(baked: Coded, views: list[View]) -> float:
 
 @pytest.mark.parametrize("compact", [None, Compact(share=0.05, views=2)], ids=["pages", "compact"])
 def test_texels_are_tuned_as_on_the_cpu(
-    compact: Compact | None, device: torch.device, cpu: Context, learned_on: set[bool]
+    compact: Compact | None, device: torch.device, cpu, learned_on: set[bool]
 ) -> None:
     with cpu():
         scene, views = trained()
@@ -80,9 +78,7 @@ def test_texels_are_tuned_as_on_the_cpu(
         torch.testing.assert_close(got.texels, want.texels, rtol=1e-3, atol=1e-3)
 
 
-def test_texels_and_surfels_are_polished_as_on_the_cpu(
-    device: torch.device, cpu: Context, learned_on: set[bool]
-) -> None:
+def test_texels_and_surfels_are_polished_as_on_the_cpu(device: torch.device, cpu, learned_on: set[bool]) -> None:
     with cpu():
         scene, views = trained()
     refine = RefineOptions(

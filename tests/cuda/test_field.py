@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene import Camera, HashField
+from tests.cuda.conftest import HERE, in_orders
 from tests.ops.golden import random_scene
 from tests.ops.test_kernels import make_field, relative
 
@@ -34,14 +34,11 @@ def value_and_gradients(field: HashField, x: Tensor) -> list[Tensor]:
 @pytest.mark.parametrize("contract", [True, False])
 @pytest.mark.parametrize(("count", "close"), [(1, False), (31, False), (33, False), (300, False), (300, True)])
 def test_values_and_gradients_against_the_cpu(
-    count: int, close: bool, contract: bool, dtype: torch.dtype, device: torch.device, cpu
+    count: int, close: bool, contract: bool, dtype: torch.dtype, both
 ) -> None:
     """Against the CPU, which tests/ops checks against the reference and finite differences."""
-    x = points(count, device, dtype, close)
-    field = make_field(contract, dtype).to(device)
-    got = value_and_gradients(field, x)
-    with cpu():
-        want = value_and_gradients(field.cpu(), x.cpu())
+    field = make_field(contract, dtype)
+    got, want = both(lambda where: value_and_gradients(field.to(where), points(count, where, dtype, close)))
     for a, b in zip(got, want, strict=True):
         assert relative(a, b) < (1e-11 if dtype == torch.float64 else 2e-4)
 
@@ -86,11 +83,9 @@ class Shading:
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 @pytest.mark.parametrize("mode", ["frozen", "learn", "move"])
-def test_shading_against_the_cpu(mode: str, dtype: torch.dtype, device: torch.device, cpu) -> None:
+def test_shading_against_the_cpu(mode: str, dtype: torch.dtype, both) -> None:
     shading = Shading(dtype)
-    got = shading.run(device, mode)
-    with cpu():
-        want = shading.run(torch.device("cpu"), mode)
+    got, want = both(lambda where: shading.run(where, mode))
     assert len(got) == len(want) == {"frozen": 2, "learn": 6, "move": 8}[mode]
     for a, b in zip(got, want, strict=True):
         assert b.abs().max() > 0
@@ -107,32 +102,22 @@ def test_without_fragments(device: torch.device, cpu) -> None:
 
 def test_deterministic_sums_do_not_depend_on_the_order_of_threads(device: torch.device, cpu, exactly) -> None:
     shading = Shading(torch.float32)
-    if device.type == "cpu":
-        runs = []
-        for seed in range(3):
-            with emulated_cuda(seed):
-                runs.append(shading.run(device, "move"))
-    else:
-        runs = [shading.run(device, "move") for _ in range(5)]
-    for other in runs[1:]:
-        for a, b in zip(runs[0], other, strict=True):
-            assert torch.equal(a, b)
+    first, *others = in_orders(device, lambda: shading.run(device, "move"))
+    assert all(torch.equal(a, b) for other in others for a, b in zip(first, other, strict=True))
     with cpu():
-        want = shading.run(torch.device("cpu"), "move")
-    for a, b in zip(runs[0], want, strict=True):
+        want = shading.run(HERE, "move")
+    for a, b in zip(first, want, strict=True):
         assert relative(a, b) < 2e-4
 
 
-def test_deterministic_sums_at_points_and_frozen(device: torch.device, cpu, exactly) -> None:
+def test_deterministic_sums_at_points_and_frozen(both, exactly) -> None:
     shading = Shading(torch.float64)
-    got, points_got = (
-        shading.run(device, "frozen"),
-        value_and_gradients(shading.field.to(device), points(99, device, torch.float64)),
-    )
-    with cpu():
-        want = shading.run(torch.device("cpu"), "frozen")
-        points_want = value_and_gradients(shading.field.cpu(), points(99, torch.device("cpu"), torch.float64))
-    for a, b in zip((*got, *points_got), (*want, *points_want), strict=True):
+
+    def sums(where: torch.device) -> list[Tensor]:
+        at_points = value_and_gradients(shading.field.to(where), points(99, where, torch.float64))
+        return [*shading.run(where, "frozen"), *at_points]
+
+    for a, b in zip(*both(sums), strict=True):
         assert relative(a, b) < 1e-9
 
 

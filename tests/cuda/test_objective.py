@@ -63,15 +63,11 @@ def losses(way: Way, device: torch.device) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("name", WAYS)
-def test_every_term_is_that_of_the_cpu(
-    name: str, device: torch.device, cpu: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_term_is_that_of_the_cpu(name: str, both, monkeypatch: pytest.MonkeyPatch) -> None:
     way = WAYS[name]
     if way.drawn_alone:
         monkeypatch.setattr(Scene, "compare", lambda *_: None)
-    got = losses(way, device)
-    with cpu():
-        want = losses(way, torch.device("cpu"))
+    got, want = both(lambda where: losses(way, where))
     assert got.keys() == want.keys() and {each for each in got if "gradient" not in each} == way.terms
     for each, value in want.items():
         assert value.any() and (got[each] - value).abs().max() <= 1e-9 * value.abs().max(), each

@@ -1,7 +1,5 @@
 """Pictures without fragment lists: values and gradients against lists, in any thread order."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import pytest
@@ -10,17 +8,15 @@ from torch import Tensor
 
 import bitymi_ns
 from bitymi_ns import ops
-from bitymi_ns.ops import Unlisted, trace_cuda
-from bitymi_ns.ops.backend import emulated_cuda
+from bitymi_ns.ops import Unlisted
 from bitymi_ns.ops.parameters import GEOMETRY
+from tests.cuda.conftest import HERE, in_orders, only_short_lists
 from tests.ops.golden import SceneCase, camera_of, extreme_scenes, load_golden, random_scene
 from tests.ops.test_kernels import relative
 from tests.scene.test_texel_field import make
 from tests.test_api import camera_of as api_camera
 from tests.test_api import surfels
 
-Context = Callable[[], AbstractContextManager[None]]
-HERE = torch.device("cpu")
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 BOUND = 0.03
 
@@ -99,7 +95,7 @@ def compare(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: float) -
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 @pytest.mark.parametrize("texture, moves", [("none", True), ("colors", True), ("colors", False), ("alphas", True)])
 def test_pictures_and_gradients_are_those_of_the_cpu(
-    texture: str, moves: bool, dtype: torch.dtype, device: torch.device, cpu: Context
+    texture: str, moves: bool, dtype: torch.dtype, device: torch.device, cpu
 ) -> None:
     """Tiles with more fragments than shared memory holds and more than 32 surfels; the image ends within one."""
     case = random_scene(150, 3, width=70, height=40)
@@ -129,7 +125,7 @@ def test_the_golden_picture_and_gradients(device: torch.device) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("moved", [False, True], ids=["gradients", "descent"])
 @pytest.mark.parametrize("scene", extreme_scenes(), ids=lambda case: case.name)
-def test_extreme_scenes(scene: SceneCase, moved: bool, device: torch.device, cpu: Context) -> None:
+def test_extreme_scenes(scene: SceneCase, moved: bool, device: torch.device, cpu) -> None:
     got = Learned(scene, torch.float64, device, extreme=True, moved=moved).draw(False)
     with cpu():
         want = Learned(scene, torch.float64, HERE, extreme=True, moved=moved).draw(True)
@@ -140,7 +136,7 @@ def test_extreme_scenes(scene: SceneCase, moved: bool, device: torch.device, cpu
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (40, 2)], ids=str)
 @pytest.mark.parametrize("surfels", ["none", "one behind the camera", "40 and one that is not finite"])
 def test_nothing_to_see_and_pictures_smaller_than_a_tile(
-    surfels: str, size: tuple[int, int], texture: str, device: torch.device, cpu: Context
+    surfels: str, size: tuple[int, int], texture: str, device: torch.device, cpu
 ) -> None:
     case = random_scene(41, 3, *size)
     if surfels == "none":
@@ -169,13 +165,11 @@ def test_surfels_of_one_opacity(opacity: float, device: torch.device) -> None:
 
 
 def test_only_sums_of_texels_depend_on_the_order_of_threads(device: torch.device) -> None:
-    runs = []
-    for seed in range(4):
-        with emulated_cuda(seed) if device == HERE else nullcontext():
-            runs.append(Learned(random_scene(60, 3, width=70, height=40), torch.float32, device).draw(False))
-    for other in runs[1:]:
-        for name in runs[0].keys() - {"texels", "alphas"}:
-            assert torch.equal(other[name], runs[0][name]), name
+    case = random_scene(60, 3, width=70, height=40)
+    first, *others = in_orders(device, lambda: Learned(case, torch.float32, device).draw(False))
+    for other in others:
+        for name in first.keys() - {"texels", "alphas"}:
+            assert torch.equal(other[name], first[name]), name
 
 
 def test_its_fragments_are_those_of_the_list(device: torch.device, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -191,20 +185,13 @@ def test_its_fragments_are_those_of_the_list(device: torch.device, monkeypatch: 
     assert torch.equal(unlisted.overdraw(), fragments.overdraw())
     assert [torch.equal(part.weight, fragments.weight) for part in unlisted.lists()] == [True]
 
-    overdraw, empty_list = fragments.overdraw(), trace_cuda.empty_list
+    overdraw = fragments.overdraw()
     fit = max(int(rows.sum()) for rows in overdraw.split(16))  # fragments of a row of tiles
-
-    def small_ones(geom: Tensor, count: int) -> dict[str, Tensor]:
-        if count > fit:
-            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
-        return empty_list(geom, count)
-
-    monkeypatch.setattr(trace_cuda, "empty_list", small_ones)
-    monkeypatch.setattr(trace_cuda, "fragment_capacity", lambda geom: fit)
+    only_short_lists(monkeypatch, fit, fit)
     assert len(list(unlisted.lists())) == 3 and torch.equal(unlisted.overdraw(), overdraw)
 
 
-def test_it_draws_on_cards_alone_and_not_where_sums_are_exact(device: torch.device, cpu: Context, exactly) -> None:
+def test_it_draws_on_cards_alone_and_not_where_sums_are_exact(device: torch.device, cpu, exactly) -> None:
     assert not ops.can_rasterize(device)
     torch.use_deterministic_algorithms(False)
     learned = Learned(random_scene(6, 3, width=20, height=10), torch.float32, HERE, "none")

@@ -3,9 +3,9 @@
 import pytest
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from bitymi_ns import ops
+from tests.cuda.test_training_view import Operations
 from tests.ops.golden import SceneCase, load_golden, random_scene
 from tests.scene.small import scene_of
 
@@ -27,18 +27,16 @@ def step(case: SceneCase, device: torch.device, texture: bool, mode: str) -> dic
 
 @pytest.mark.parametrize(("texture", "mode"), [(False, "off"), (True, "frozen"), (True, "train")])
 @pytest.mark.parametrize("name", ["random", "inside_the_scene", "seed 5"])
-def test_a_training_step_equals_that_of_the_cpu(name: str, texture: bool, mode: str, device: torch.device, cpu) -> None:
+def test_a_training_step_equals_that_of_the_cpu(name: str, texture: bool, mode: str, both) -> None:
     case = random_scene(40, 5, 33, 21) if name == "seed 5" else load_golden(name)
-    got = step(case, device, texture, mode)
-    with cpu():
-        want = step(case, torch.device("cpu"), texture, mode)
+    got, want = both(lambda where: step(case, where, texture, mode))
     assert got.keys() == want.keys()
     assert any("field" in key for key in got) == (mode == "train")
     for key, value in want.items():
         assert (got[key] - value).abs().max() <= 1e-9 * value.abs().max(), key
 
 
-def test_masked_counts_equal_those_of_the_cpu(device: torch.device, cpu) -> None:
+def test_masked_counts_equal_those_of_the_cpu(both) -> None:
     case = random_scene(40, 5, 33, 21)
     mask = torch.rand(33 * 21, generator=torch.Generator().manual_seed(0)) < 0.5
 
@@ -46,21 +44,8 @@ def test_masked_counts_equal_those_of_the_cpu(device: torch.device, cpu) -> None
         scene, camera = scene_of(case, device, False)
         return scene.render(camera).fragments.masked_counts(mask.to(device)).cpu()
 
-    got = counts(device)
-    with cpu():
-        assert torch.equal(got, counts(torch.device("cpu"))) and got.any()
-
-
-class Waits(TorchDispatchMode):
-    """Counter of operations that make the host wait for a GPU."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += func.overloadpacket in (torch.ops.aten._local_scalar_dense, torch.ops.aten.nonzero)
-        return func(*args, **(kwargs or {}))
+    got, want = both(counts)
+    assert torch.equal(got, want) and got.any()
 
 
 @pytest.mark.parametrize(("texture", "maps", "waits"), [(False, False, 1), (False, True, 2), (True, True, 3)])
@@ -69,6 +54,6 @@ def test_a_step_waits_for_no_more_than_the_lengths_of_lists(
 ) -> None:
     scene, camera = scene_of(random_scene(40, 5, 33, 21), device, texture)
     scene.render(camera, maps=maps)  # warm-up, for cached values
-    with Waits() as counted:
+    with Operations() as counted:
         scene.render(camera, maps=maps).rgb.mean().backward()
-    assert counted.count == waits
+    assert counted.waits == waits

@@ -34,8 +34,7 @@ def accumulated(device: torch.device, dtype: torch.dtype) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-def test_statistics(dtype: torch.dtype, device: torch.device, cpu) -> None:
-    found = accumulated(device, dtype)
-    with cpu():
-        torch.testing.assert_close(found, accumulated(torch.device("cpu"), dtype), rtol=1e-6, atol=1e-6)
+def test_statistics(dtype: torch.dtype, both) -> None:
+    found, want = both(lambda where: accumulated(where, dtype))
+    torch.testing.assert_close(found, want, rtol=1e-6, atol=1e-6)
     assert found.isfinite().all()

@@ -1,8 +1,5 @@
 """Texels on CUDA: any tile, any number of fragments, partial lists, coverage."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
-
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -12,8 +9,6 @@ from torch import Tensor
 from bitymi_ns import ops
 from tests.ops.test_kernels import relative
 from tests.ops.test_texel import Case, check_coverage, check_parts, check_surfel_coverage, one_surfel
-
-Context = Callable[[], AbstractContextManager[None]]
 
 
 def of_one_surfel(
@@ -37,9 +32,7 @@ def of_one_surfel(
     st.sampled_from([1, 16, 70]),
     st.integers(0, 2**31),
 )
-def test_one_surfel_of_any_tile(
-    device: torch.device, cpu: Context, size: tuple[int, int], extent: float, huge: float, count: int, seed: int
-) -> None:
+def test_one_surfel_of_any_tile(both, size: tuple[int, int], extent: float, huge: float, count: int, seed: int) -> None:
     """Fragments of one tile in the same and different cells, at texel centres, between and beyond them."""
     g = torch.Generator().manual_seed(seed)
     sides = torch.tensor(size, dtype=torch.float64)[:, None]
@@ -50,9 +43,7 @@ def test_one_surfel_of_any_tile(
     tiles = ops.TexelTiles.of_sizes(torch.tensor([size]), torch.tensor([extent], dtype=torch.float64))
     base, texels = (torch.randn(n, 3, generator=g, dtype=torch.float64) for n in (1, tiles.count))
     towards = huge * torch.randn(count, 3, generator=g, dtype=torch.float64)
-    got = of_one_surfel(device, uv, weight, tiles, base, texels, towards)
-    with cpu():
-        want = of_one_surfel(torch.device("cpu"), uv, weight, tiles, base, texels, towards)
+    got, want = both(lambda where: of_one_surfel(where, uv, weight, tiles, base, texels, towards))
     assert all(relative(a, b) < 1e-12 for a, b in zip(got, want, strict=True))
 
 

@@ -1,7 +1,5 @@
 """Alpha texels on CUDA: fragments and gradients against the CPU, which tests/ops checks by finite differences."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 
 import pytest
@@ -9,12 +7,10 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.parameters import GEOMETRY
+from tests.cuda.conftest import HERE, in_orders
 from tests.cuda.test_trace import by_pixel_and_surfel
 from tests.ops.golden import SceneCase, camera_of, random_scene, relative
-
-CpuContext = Callable[[], AbstractContextManager[None]]
 
 
 @dataclass
@@ -78,12 +74,8 @@ def is_cut(cut: Cut, fragments: ops.Fragments) -> Tensor:
     ],
     ids=lambda cut: f"{cut.bound} {len(cut.size)}",
 )
-def test_fragments_and_gradients_are_those_of_the_cpu(
-    cut: Cut, seen: str, device: torch.device, cpu: CpuContext
-) -> None:
-    got, gradients = traced(cut, torch.float64, device, seen)
-    with cpu():
-        want, expected = traced(cut, torch.float64, torch.device("cpu"), seen)
+def test_fragments_and_gradients_are_those_of_the_cpu(cut: Cut, seen: str, both) -> None:
+    (got, gradients), (want, expected) = both(lambda where: traced(cut, torch.float64, where, seen))
     for a, b in zip(by_pixel_and_surfel(got), by_pixel_and_surfel(want), strict=True):
         assert a.shape == b.shape and relative(a, b) < 1e-9
     marks = is_cut(cut, got)
@@ -103,11 +95,11 @@ def test_alphas_of_one_change_nothing(device: torch.device) -> None:
         assert relative(gradients[key], expected[key]) < 1e-5, key
 
 
-def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
+def test_single_precision(device: torch.device, cpu) -> None:
     cut = cut_scene(8)
     got, gradients = traced(cut, torch.float32, device)
     with cpu():
-        want, expected = traced(cut, torch.float64, torch.device("cpu"))
+        want, expected = traced(cut, torch.float64, HERE)
     assert abs(len(got) - len(want)) <= 3  # a fragment at a threshold
     for key, value in expected.items():
         error = (gradients[key] - value).abs() / value.abs().max()
@@ -116,16 +108,11 @@ def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
 
 @pytest.mark.usefixtures("exactly")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["single", "double"])
-def test_deterministic_gradients(dtype: torch.dtype, device: torch.device, cpu: CpuContext) -> None:
+def test_deterministic_gradients(dtype: torch.dtype, device: torch.device, cpu) -> None:
     """Sums do not depend on the order of blocks and equal the CPU's."""
-    cut, found = cut_scene(9), []
-    for seed in range(3):
-        if device.type == "cuda":
-            found.append(traced(cut, dtype, device)[1]["alpha"])
-        else:
-            with emulated_cuda(seed):
-                found.append(traced(cut, dtype, device)[1]["alpha"])
+    cut = cut_scene(9)
+    found = in_orders(device, lambda: traced(cut, dtype, device)[1]["alpha"], 3)
     assert all(torch.equal(other, found[0]) for other in found[1:])
     with cpu():
-        want = traced(cut, dtype, torch.device("cpu"))[1]["alpha"]
+        want = traced(cut, dtype, HERE)[1]["alpha"]
     assert relative(found[0], want) < (1e-3 if dtype == torch.float32 else 1e-10)

@@ -1,7 +1,5 @@
 """Texel scenes on the device: pictures, tiles and whole runs as on the CPU, and their changes in number."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import pytest
@@ -17,12 +15,11 @@ from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.texels import blank_texels
 from bitymi_ns.train.views import View
+from tests.cuda.conftest import HERE
 from tests.ops.golden import random_scene
 from tests.scene.test_texel_field import make
 from tests.train import part_of_a_run
 
-Context = Callable[[], AbstractContextManager[None]]
-HERE = torch.device("cpu")
 STEPS, START = 12, 6
 
 
@@ -37,10 +34,8 @@ def drawn(device: torch.device, most: int = 0) -> tuple[dict[str, Tensor], int]:
 
 
 @pytest.mark.parametrize("most", [0, 4500])
-def test_a_picture_and_its_gradients_are_those_of_the_cpu(most: int, device: torch.device, cpu: Context) -> None:
-    got, lists = drawn(device, most)
-    with cpu():
-        want, cpu_lists = drawn(HERE, most)
+def test_a_picture_and_its_gradients_are_those_of_the_cpu(most: int, both) -> None:
+    (got, lists), (want, cpu_lists) = both(lambda where: drawn(where, most))
     assert got.keys() == want.keys() >= {"field.texels", "surfels.means"} and lists == cpu_lists == (2 if most else 1)
     for name, value in want.items():
         assert (got[name] - value).abs().max() <= 1e-9 * value.abs().max(), name
@@ -79,17 +74,9 @@ def state_of(scene: Scene) -> dict[str, Tensor]:
     return {name: value.detach().cpu().clone() for name, value in scene.state_dict().items()}
 
 
-def test_tiles_and_coverage_are_those_of_the_cpu(device: torch.device, cpu: Context) -> None:
-    fields = []
-    for where, context in ((device, None), (HERE, cpu)):
-        scene, views = scene_and_views()
-        scene = scene.to(where)
-        if context is None:
-            fields.append(blank_texels(scene, views, 4, config().texels))
-        else:
-            with context():
-                fields.append(blank_texels(scene, views, 4, config().texels))
-    got, want = fields
+def test_tiles_and_coverage_are_those_of_the_cpu(device: torch.device, both) -> None:
+    scene, views = scene_and_views()
+    got, want = both(lambda where: blank_texels(scene.to(where), views, 4, config().texels))
     assert got.texels.device.type == device.type and len(got.texels) == len(want.texels) > 200
     assert torch.equal(got.size.cpu(), want.size) and want.size.max() > 4
     torch.testing.assert_close(got.extent.cpu(), want.extent, rtol=1e-4, atol=1e-5)
@@ -98,7 +85,7 @@ def test_tiles_and_coverage_are_those_of_the_cpu(device: torch.device, cpu: Cont
 
 
 @pytest.mark.parametrize("alpha_rate", [0.0, 0.5])
-def test_a_run_is_that_of_the_cpu(alpha_rate: float, device: torch.device, cpu: Context) -> None:
+def test_a_run_is_that_of_the_cpu(alpha_rate: float, device: torch.device, both) -> None:
     def losses(where: torch.device) -> tuple[list[float], list[int], dict[str, Tensor]]:
         trainer, seen, surfels = trainer_on(where, alpha_rate), [], []
         for _ in range(STEPS):
@@ -107,9 +94,7 @@ def test_a_run_is_that_of_the_cpu(alpha_rate: float, device: torch.device, cpu: 
             surfels.append(len(trainer.scene))
         return seen, surfels, state_of(trainer.scene)
 
-    got, surfels, state = losses(device)
-    with cpu():
-        want, cpu_surfels, cpu_state = losses(HERE)
+    (got, surfels, state), (want, cpu_surfels, cpu_state) = both(losses)
     assert got == pytest.approx(want, rel=2e-3)
     assert surfels == cpu_surfels and surfels[-1] < surfels[START]  # pruned while texels learned
     assert state.keys() == cpu_state.keys() and torch.equal(state["field.size"], cpu_state["field.size"])
@@ -146,7 +131,7 @@ def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) ->
         torch.use_deterministic_algorithms(False)
 
 
-def test_what_is_left_out_of_a_bake_is_that_of_the_cpu(device: torch.device, cpu: Context) -> None:
+def test_what_is_left_out_of_a_bake_is_that_of_the_cpu(device: torch.device, cpu) -> None:
     """Tiles and view colours are reduced on the device of the scene."""
     trainer = trainer_on(device)
     for _ in range(START + 3):

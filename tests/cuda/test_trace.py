@@ -1,7 +1,6 @@
 """Visibility and compositing on CUDA against the CPU."""
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -12,11 +11,12 @@ from torch import Tensor
 
 from bitymi_ns import ops
 from bitymi_ns.ops import bin_cuda, capacity, trace_cuda
-from bitymi_ns.ops.backend import emulated_cuda, kernel, workspace
+from bitymi_ns.ops.backend import kernel, workspace
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene import Camera
+from tests.cuda.conftest import HERE, in_orders
 from tests.ops.golden import (
     GOLDEN_NAMES,
     SV_KEYS,
@@ -33,7 +33,6 @@ from tests.ops.golden import (
     values_of,
 )
 
-CpuContext = Callable[[], AbstractContextManager[None]]
 EXACT_RIM = 1e-12  # the references bound nothing
 
 
@@ -126,22 +125,20 @@ def scenes() -> Iterator[Any]:
 
 @pytest.mark.parametrize("case, options, bounds", scenes())
 def test_fragments_images_and_gradients_equal_those_of_the_cpu(
-    case: SceneCase, options: dict[str, Any], bounds: dict[str, float], device: torch.device, cpu: CpuContext
+    case: SceneCase, options: dict[str, Any], bounds: dict[str, float], both
 ) -> None:
     """Against the CPU, which tests/ops checks against golden renders and references."""
-    got = render(case, torch.float64, device, **options)
-    with cpu():
-        want = render(case, torch.float64, torch.device("cpu"), **options)
+    got, want = both(lambda where: render(case, torch.float64, where, **options))
     assert got.image.isfinite().all() and all(value.isfinite().all() for value in got.leaves.values())
     compare(got, want, **bounds)
     check_order(got.fragments)
 
 
-def test_single_precision(device: torch.device, cpu: CpuContext) -> None:
+def test_single_precision(device: torch.device, cpu) -> None:
     case = random_scene(60, 5, 70, 50)
     got = render(case, torch.float32, device, rim=1e-3)
     with cpu():
-        want = render(case, torch.float64, torch.device("cpu"), rim=1e-3)
+        want = render(case, torch.float64, HERE, rim=1e-3)
     assert got.fragments.weight.dtype == torch.float32
     error = (got.image - want.image).abs() / want.image.abs().max()
     assert (error < 1e-5).double().mean() > 0.999  # the thresholds of alpha and transmittance may flip
@@ -168,16 +165,12 @@ def test_no_fragment_of_thin_small_and_large_surfels_is_lost(
     assert ((found > 0) != (want > 0)).double().mean() <= (0 if dtype == torch.float64 else 1e-4)
 
 
-def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(
-    device: torch.device, cpu: CpuContext
-) -> None:
+def test_more_surfels_in_a_tile_than_a_warp_has_lanes_and_pixels_that_close(both) -> None:
     """Opaque layers end every pixel long before the tile's list ends; translucent ones use all of it."""
     case = random_scene(150, 7, 20, 20, scale=1.0)
     for logit, closes in ((3.0, True), (-4.0, False)):
         case.params["opacity_logits"] = torch.full((150,), logit, dtype=torch.float64)
-        got = render(case, torch.float64, device)
-        with cpu():
-            want = render(case, torch.float64, torch.device("cpu"))
+        got, want = both(lambda where: render(case, torch.float64, where))
         compare(got, want)
         assert got.fragments.layout.handle.pairs > 3 * 64
         alpha = got.image[:, 3]
@@ -225,15 +218,8 @@ def test_lists_that_differ_from_the_counts_stay_in_their_slots(fewer: str, devic
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 def test_every_order_of_the_threads_gives_the_same_bits(dtype: torch.dtype, device: torch.device) -> None:
     case = random_scene(50, 11, 40, 30)
-    results = []
-    for seed in (2, 3, 4):
-        if device.type == "cuda":
-            results.append(render(case, dtype, device))
-            continue
-        with emulated_cuda(seed):
-            results.append(render(case, dtype, device))
-    first = results[0]
-    for other in results[1:]:
+    first, *others = in_orders(device, lambda: render(case, dtype, device), 3)
+    for other in others:
         for name, array in first.fragments.arrays.items():
             assert torch.equal(array, other.fragments.arrays[name])
         assert torch.equal(first.image, other.image)
@@ -242,7 +228,7 @@ def test_every_order_of_the_threads_gives_the_same_bits(dtype: torch.dtype, devi
         assert all(torch.equal(a, b) for a, b in zip(first.mean2d, other.mean2d, strict=True))
 
 
-def test_gradients_of_weight_uv_and_depth_alone(device: torch.device, cpu: CpuContext) -> None:
+def test_gradients_of_weight_uv_and_depth_alone(device: torch.device, both) -> None:
     case = random_scene(30, 12, 24, 20)
 
     def run(where: torch.device) -> list[Tensor]:
@@ -255,9 +241,7 @@ def test_gradients_of_weight_uv_and_depth_alone(device: torch.device, cpu: CpuCo
             result += [leaf.grad.cpu() for leaf in leaves]
         return result
 
-    got = run(device)
-    with cpu():
-        want = run(torch.device("cpu"))
+    got, want = both(run)
     for a, b in zip(got, want, strict=True):
         assert relative(a, b) < 1e-10
 
@@ -293,7 +277,7 @@ def test_wrong_arrays_are_refused(device: torch.device) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("seed", range(2))
 def test_discs_across_the_camera_plane_are_listed_where_they_show(
-    seed: int, dtype: torch.dtype, device: torch.device, cpu: CpuContext
+    seed: int, dtype: torch.dtype, device: torch.device, cpu
 ) -> None:
     case = crossing_scene(60, seed, 300, 200)
     projection = ops.project(*values_of(case, dtype, device), camera_of(case, dtype))

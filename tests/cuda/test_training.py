@@ -50,10 +50,8 @@ def train(device: torch.device, background: str, exposure: str) -> tuple[list[fl
 
 
 @pytest.mark.parametrize(("background", "exposure"), [("random", "off"), ("black", "gain"), ("random", "affine")])
-def test_training_steps_equal_those_of_the_cpu(background: str, exposure: str, device: torch.device, cpu) -> None:
-    losses, psnr, parameters = train(device, background, exposure)
-    with cpu():
-        want_losses, want_psnr, want = train(torch.device("cpu"), background, exposure)
+def test_training_steps_equal_those_of_the_cpu(background: str, exposure: str, both) -> None:
+    (losses, psnr, parameters), (want_losses, want_psnr, want) = both(lambda where: train(where, background, exposure))
     assert losses == pytest.approx(want_losses, rel=1e-4)
     assert psnr == pytest.approx(want_psnr, abs=0.01)
     for name, value in want.items():
@@ -72,10 +70,8 @@ def motions(device: torch.device) -> torch.Tensor:
     return trainer.training.poses.motions
 
 
-def test_poses_move_as_on_the_cpu(device: torch.device, cpu) -> None:
-    found = motions(device)
-    with cpu():
-        want = motions(torch.device("cpu"))
+def test_poses_move_as_on_the_cpu(device: torch.device, both) -> None:
+    found, want = both(motions)
     assert found.device.type == "cpu" and want.abs().max() > 1e-4
     torch.testing.assert_close(found, want, rtol=0.02, atol=1e-5)
 

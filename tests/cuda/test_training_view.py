@@ -107,10 +107,8 @@ CASES = [
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: "-".join(f"{value}" for value in case.values()))
-def test_losses_and_gradients_equal_those_of_the_cpu(case: dict[str, Any], device: torch.device, cpu) -> None:
-    got = compared(device, **case)
-    with cpu():
-        want = compared(torch.device("cpu"), **case)
+def test_losses_and_gradients_equal_those_of_the_cpu(case: dict[str, Any], both) -> None:
+    got, want = both(lambda where: compared(where, **case))
     assert got.keys() == want.keys() and ("gradient of field.texels" in want) == (
         case.get("texture") in ("texels", "alpha")
     )

@@ -177,7 +177,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         what = f"{label} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used"
-        fail(f"{what}: size and focal lengths have to be positive, all numbers finite. Correct it.")
+        fail(f"{what}: size and focal lengths have to be positive, all numbers finite. Correct it; leave signs out.")
     center = (camera.principal_point_x, camera.principal_point_y)
     lens = Lens(colmap, stored, Pinhole(*focal, *center, width, height))
     if not lens.distorts:

@@ -169,10 +169,10 @@ def models_in(data: Path) -> list[Path]:
     folders = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
     models = [path.relative_to(data) for path in folders if is_model(path)]
 
-    def rank(model: Path) -> tuple[bool, int, str, int, str]:
+    def rank(model: Path) -> tuple[int, str, int, str]:
         first = str(model.with_name("0") if model.name.isdigit() else model)  # sparse/1 ranks as sparse/0 does
-        place = (first not in MODELS, MODELS.index(first) if first in MODELS else 0)
-        return *place, str(model.parent), -image_count(data / model), str(model)
+        place = MODELS.index(first) if first in MODELS else len(MODELS)
+        return place, str(model.parent), -image_count(data / model), str(model)
 
     return sorted((model for model in models if not any(part[0] == "." for part in model.parts)), key=rank)
 

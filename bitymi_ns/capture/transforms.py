@@ -203,9 +203,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
         return None
 
     width, height, cx, cy = (None if (entry := value(key)) is None else entry[1] for key in ("w", "h", "cx", "cy"))
-    if (
-        width is None or height is None
-    ):  # missing pictures are reported when read; where none are needed any size serves
+    if width is None or height is None:  # missing pictures are reported when they are read, if any are
         size = image_size(file) or (height or UNKNOWN_SIZE, width or UNKNOWN_SIZE)
         width, height = width or size[0], height or size[1]
     middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)

@@ -33,10 +33,8 @@ MODELS = {
 CAMERA_TYPES = {
     **dict.fromkeys(("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"), "PERSPECTIVE"),
     "OPENCV_FISHEYE": "FISHEYE", "EQUIRECTANGULAR": "EQUIRECTANGULAR", "FISHEYE624": "FISHEYE624",
-    "OMNIDIRECTIONALSTEREO_L": "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R": "OMNIDIRECTIONALSTEREO_R",
-    "VR180_L": "VR180_L", "VR180_R": "VR180_R", "ORTHOPHOTO": "ORTHOPHOTO",
 }  # fmt: skip
-"""nerfstudio's camera types by camera_model; the last two lines cannot be trained on."""
+"""nerfstudio's camera types by camera_model, of those that can be trained on."""
 MAX_SIDE = 1 << 20  # largest plausible width or height of a picture, pixels
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 DISTORTION = (*COEFFICIENTS, "distortion_params")
@@ -239,8 +237,8 @@ def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tupl
     label = f"of {frame['file_path']}"
     model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))
     if not isinstance(model, str) or model not in CAMERA_TYPES:
-        advice = f"nerfstudio knows {', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
-        fail(f"{path}: the camera_model {model!r} {label} is unknown. {advice}")
+        advice = f"Those known are {', '.join(CAMERA_TYPES)}; for undistorted photographs write PINHOLE."
+        fail(f"{path}: the camera_model {model!r} {label} cannot be used. {advice}")
     kind = CAMERA_TYPES[model]
     holder = frame if any(key in frame for key in DISTORTION) else meta
     if "distortion_params" in holder:

@@ -115,9 +115,7 @@ def test_a_photograph_of_another_size_is_named(tmp_path: Path) -> None:
     ("model", "params", "message"),
     [
         ("EQUIRECTANGULAR", (96.0, 72.0), "camera 1 is EQUIRECTANGULAR, .*twice as wide.* but .* 96 x 72 pixels"),
-        ("PINHOLE", (math.nan, 80.0, 48.0, 36.0), "camera 1 .*has to be positive|have to be positive"),
-        ("PINHOLE", (-80.0, 80.0, 48.0, 36.0), "focal lengths have to be positive"),
-        ("SIMPLE_RADIAL", (80.0, 48.0, 36.0, math.inf), "all numbers finite"),
+        ("PINHOLE", (-80.0, math.nan, 48.0, 36.0), "focal lengths have to be positive, all numbers finite"),
         ("SIMPLE_RADIAL", (80.0, 48.0, 36.0, -100.0), "lens distortion of camera 1 is absurd: .*would leave"),
         ("SIMPLE_RADIAL", (80.0, 480.0, 36.0, 0.1), "lens distortion of camera 1 is absurd"),
     ],

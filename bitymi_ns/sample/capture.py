@@ -1,6 +1,7 @@
 """Render the sample room along a camera path and write it as a nerfstudio capture."""
 
 import json
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 from typing import NamedTuple
@@ -157,9 +158,8 @@ def _image(k: int) -> str:
 
 def _files_of(folder: Path) -> list[str] | None:
     """List the files of a sample; None: the folder is none."""
-    try:
-        made_by = read_json(folder / CAPTURE).get("made_by")
-    except (FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
-        return None
-    images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
-    return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)] if made_by == MADE_BY else None
+    with suppress(FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
+        if read_json(folder / CAPTURE).get("made_by") == MADE_BY:
+            images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
+            return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)]
+    return None

@@ -12,6 +12,7 @@ from bitymi_ns.capture import kinds
 from bitymi_ns.capture.folder_contents import images_of, passed_over, poses_in
 from bitymi_ns.capture.kinds import Kind
 from bitymi_ns.capture.points import Points, cloud_beside
+from bitymi_ns.capture.recognise import _scanned
 from bitymi_ns.capture.sfm_photos import find_photos
 from bitymi_ns.capture.splits import lists_by_name, read_split_lists
 from bitymi_ns.capture.types import ColmapCamera, Photograph
@@ -125,6 +126,15 @@ def test_clouds_that_nothing_names(row: Kind, name: str, whose: str, tmp_path: P
 def test_lists_of_splits(row: Kind, name: str, whose: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text("a.png\n")
     assert read_split_lists(tmp_path, tmp_path, []).names == {row.what: ["a.png"]}
+
+
+@pytest.mark.parametrize("row", kinds.SCANS)
+def test_scans(row: Kind, tmp_path: Path) -> None:
+    for name in row.names.split():
+        assert row.what not in [format for format, _ in _scanned(tmp_path)]
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name.replace("*", "0")).write_text(row.mark)
+    assert [format for format, _ in _scanned(tmp_path)] == [row.what]
 
 
 @pytest.mark.parametrize("rows", [kinds.NSVF, kinds.PROCESSED])

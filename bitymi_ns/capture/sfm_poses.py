@@ -113,8 +113,8 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
             unused.append(f"--sfm.{each.name.replace('_', '-')} {value}")
     if unused:
         warn(
-            f"{' and '.join(unused)} is not used: the run goes on with the poses it was trained with, in {folder}. To "
-            "have poses computed again, start a new run: leave out --load-dir and --load-checkpoint."
+            f"{' and '.join(unused)} {'is' if len(unused) == 1 else 'are'} not used: the run goes on with the poses it "
+            f"was trained with, in {folder}. To have others computed, leave out --load-dir and --load-checkpoint."
         )
     return settings or requested
 

@@ -69,9 +69,7 @@ def camera_of(width: int = 24, height: int = 18) -> bitymi_ns.Camera:
 
 
 @pytest.mark.parametrize("most", [trace_cpu.MOST, 600])
-def test_rasterize_gives_values_and_gradients_of_the_float64_reference(
-    most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_rasterize_agrees_with_the_float64_reference(most: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also in bands, where memory holds few fragments."""
     monkeypatch.setattr(trace_cpu, "MOST", most)
     values, camera, background = surfels(), camera_of(), torch.tensor([0.1, 0.5, 0.9], dtype=torch.float64)
@@ -93,7 +91,6 @@ def test_rasterize_gives_values_and_gradients_of_the_float64_reference(
 
 
 def flat(**changes: float) -> dict[str, torch.Tensor]:
-    """Make a float32 surfel that faces the camera."""
     values = {"opacities": 0.7, "betas": 2.0, **changes}
     numbers = {name: torch.tensor([value]) for name, value in values.items() if name in ("opacities", "betas")}
     scales = torch.full((1, 2), values.get("scales", 0.5))

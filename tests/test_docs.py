@@ -55,7 +55,6 @@ def anchors(page: Path) -> set[str]:
 
 
 def dead_links(page: Path) -> list[str]:
-    """List a page's broken relative links."""
     dead = []
     for link in LINK.findall(without_code(page.read_text("utf8"))):
         if OUTSIDE.match(link):

@@ -25,7 +25,6 @@ ELSEWHERE |= {
 
 
 def value_of(option: str) -> Any:
-    """Look up the default of an option named as in the tables."""
     prefix = max((root for root in ROOTS if option.startswith(root)), key=len)
     value = ROOTS[prefix]
     for name in option.removeprefix(prefix).replace("-", "_").split("."):

@@ -10,7 +10,6 @@ CODE = r"`(\w+)`"
 
 
 def rows(section: str) -> list[list[str]]:
-    """Parse the rows of a section's first table, cells stripped."""
     text = (ROOT / "docs" / "glossary.md").read_text("utf8")
     table = text.split(f"## {section}\n")[1].split("\n## ")[0].split("\n\n| ", 1)[-1]
     lines = [line for line in ("| " + table).split("\n\n")[0].splitlines() if line.startswith("| ")]

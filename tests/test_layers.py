@@ -14,20 +14,7 @@ import bitymi_ns
 
 PACKAGE = Path(bitymi_ns.__file__).parent
 ORDER = ["ops", "scene", "codec", "bundle", "train", "bake", "interchange", "view", "plugin", "measure"]
-BESIDE = [
-    "errors",
-    "exit_messages",
-    "files",
-    "locks",
-    "ply",
-    "presets",
-    "progress",
-    "ranges",
-    "safe_reading",
-    "sample",
-    "capture",
-    "trust",
-]
+BESIDE = "errors exit_messages files locks ply presets progress ranges safe_reading sample capture trust".split()
 """Modules beside the layers (ORDER, innermost first); these import no layer."""
 KNOW_NERFSTUDIO = ("plugin",)
 
@@ -60,7 +47,6 @@ def imports(path: Path) -> Iterator[tuple[str, bool]]:
 
 
 def module_of(name: str) -> str | None:
-    """Return the module of this package that an import refers to."""
     while name and name not in MODULES:
         name = name.rpartition(".")[0]
     return name or None

@@ -7,18 +7,11 @@ from pathlib import Path
 import pytest
 
 PAGE = (Path(__file__).parents[1] / "docs/licences.md").read_text("utf8").lower()
-LIBRARIES = {
-    "libx264": "libx264",
-    "libx265": "libx265",
-    "libavcodec": "ffmpeg",
-    "libheif": "libheif",
-    "libqt5core": "qt",
-}
+LIBRARIES = {"libavcodec": "ffmpeg", "libqt5core": "qt", **{name: name for name in ("libx264", "libx265", "libheif")}}
 """Files of wheels, and their names on the page."""
 
 
 def needed(name: str, seen: dict[str, importlib.metadata.Distribution]) -> None:
-    """Collect a distribution and all that it depends on here."""
     key = re.sub(r"[-_.]+", "-", name).lower()
     try:
         found = importlib.metadata.distribution(name)

@@ -2,13 +2,14 @@
 
 import tracemalloc
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.ply import PlyError, parse_header, read_header, read_rows, write_ply
+from bitymi_ns.ply import PlyError, parse_header, parse_ply, read_header, read_rows, write_ply
 
 HEADER = (
     "ply\nformat {} 1.0\ncomment Création\nobj_info by a test\nelement camera 2\nproperty double f\n"
@@ -95,12 +96,61 @@ def test_no_header_raises_anything_else(noise: bytes, at: int) -> None:
         pass
 
 
-def test_another_reader_finds_what_a_bundle_holds(tmp_path: Path) -> None:
-    plyfile = pytest.importorskip("plyfile")
-    columns = {"x": np.float32([1.5, -2.0]), "tile_x": np.int32([4, 2**31 - 1])}
-    write_ply(tmp_path / "a.ply", columns, ["made by a test"], {"term": {"a": np.arange(3, dtype=np.float32)}})
-    found = plyfile.PlyData.read(tmp_path / "a.ply")
-    assert [element.name for element in found] == ["vertex", "term"] and found.comments == ["made by a test"]
-    for name, column in columns.items():
-        np.testing.assert_array_equal(found["vertex"][name], column)
-    np.testing.assert_array_equal(found["term"]["a"], [0, 1, 2])
+COLUMNS = {"x": np.float32([1.5, -2.0, 3e30]), "y": np.zeros(3, np.float32), "tile_x": np.int32([0, 4, 2**31 - 1])}
+MORE = {"term": {"a": np.arange(5, dtype=np.float32)}, "none": {"b": np.zeros(0, dtype=np.int32)}}
+
+
+def of_a_bundle(path: Path, columns: Any = COLUMNS, **options: Any) -> bytes:
+    write_ply(path, columns, **options)
+    return path.read_bytes()
+
+
+def test_the_file_is_plain_ply(tmp_path: Path) -> None:
+    header, body = of_a_bundle(tmp_path / "a.ply", comments=["made by a test"]).split(b"end_header\n")
+    assert header.decode() == (
+        "ply\nformat binary_little_endian 1.0\ncomment made by a test\nelement vertex 3\n"
+        "property float x\nproperty float y\nproperty int tile_x\n"
+    )
+    assert body[:12] == np.float32(1.5).tobytes() + np.float32(0).tobytes() + np.int32(0).tobytes()
+    assert len(body) == 36
+
+
+def test_what_is_written_is_read_also_by_another_reader(tmp_path: Path) -> None:
+    plyfile, path = pytest.importorskip("plyfile"), tmp_path / "a.ply"
+    assert parse_ply(of_a_bundle(path, {"x": np.zeros(0, np.float32)}))["vertex"]["x"].shape == (0,)
+    found, want = parse_ply(of_a_bundle(path, comments=["by a test"], more=MORE)), {"vertex": COLUMNS, **MORE}
+    other = plyfile.PlyData.read(path)
+    assert list(found) == [element.name for element in other] == list(want) and other.comments == ["by a test"]
+    for element, columns in want.items():
+        assert list(found[element]) == list(columns)
+        for name, column in columns.items():
+            assert found[element][name].dtype == column.dtype
+            np.testing.assert_array_equal(found[element][name], column)
+            np.testing.assert_array_equal(other[element][name], column)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (b"little", b"big", "binary little-endian"),
+        (b"end_header\n", b"end_header\n\0", "too long"),
+        (b"end_header\n\0", b"end_header\n", "truncated"),
+        (b"float y", b"float \xff", "ASCII"),
+        (b"element none", b"element term", "not understood"),
+        (b"property int b\n", b"", "without properties"),
+        (b"element vertex", b"element face", "no vertices"),
+    ],
+)
+def test_files_that_no_bundle_has(tmp_path: Path, old: bytes, new: bytes, message: str) -> None:
+    data = of_a_bundle(tmp_path / "a.ply", {"x": np.zeros(2, np.float32), "y": np.zeros(2, np.float32)}, more=MORE)
+    with pytest.raises(PlyError, match=message):
+        parse_ply(data.replace(old, new))
+
+
+def test_columns_that_no_bundle_has(tmp_path: Path) -> None:
+    with pytest.raises(PlyError, match="no vertices"):
+        parse_ply(b"ply\nformat binary_little_endian 1.0\nend_header\n")
+    with pytest.raises(PlyError, match="one length"):
+        write_ply(tmp_path / "a.ply", {"x": np.zeros(2), "y": np.zeros(3)})
+    with pytest.raises(PlyError, match="x is not finite in row 1"):
+        parse_ply(of_a_bundle(tmp_path / "a.ply", {"x": np.array([0, np.nan, np.inf])}))

@@ -104,9 +104,7 @@ PLACES = {
 
 @pytest.mark.parametrize("plant", [link, hard_link, no_such, pipe])
 @pytest.mark.parametrize("action", list(PLACES), ids=lambda action: action.__name__)
-def test_nothing_is_written_through_what_was_planted(
-    action: Callable[[Path], None], plant: Plant, victim: Path, tmp_path: Path
-) -> None:
+def test_links_are_not_written(action: Callable[[Path], None], plant: Plant, victim: Path, tmp_path: Path) -> None:
     where = tmp_path / "where"
     where.mkdir()
     plant(where / PLACES[action], victim)
@@ -117,9 +115,7 @@ def test_nothing_is_written_through_what_was_planted(
 
 @pytest.mark.parametrize("plant", [link, hard_link, no_such])
 @pytest.mark.parametrize("name", [".x.new", ".x.old"])
-def test_folders_on_their_way_are_not_made_of_what_was_planted(
-    name: str, plant: Plant, victim: Path, tmp_path: Path
-) -> None:
+def test_unfinished_folders_are_not_made_of_links(name: str, plant: Plant, victim: Path, tmp_path: Path) -> None:
     plant(tmp_path / name, victim)
     with pytest.raises(Refused) as refused, files.complete_folder(tmp_path / "x"):
         pass
@@ -181,9 +177,7 @@ def test_a_folder_of_others_beside_the_photographs_is_not_used(photographs: Path
 
 @pytest.mark.parametrize("name", ["result", "model", "masks", "images", "links", "database.db", "poses.txt"])
 @pytest.mark.parametrize("plant", [link, no_such, hard_link])
-def test_a_folder_of_an_archive_that_holds_links_is_not_used(
-    name: str, plant: Plant, photographs: Path, victim: Path
-) -> None:
+def test_a_work_folder_that_holds_links_is_not_used(name: str, plant: Plant, photographs: Path, victim: Path) -> None:
     used(photographs)
     plant(photographs / ".bitymi/poses-0" / name, victim)
     where, said = used(photographs)
@@ -228,9 +222,7 @@ def test_neither_place_can_be_used(photographs: Path, tmp_path: Path) -> None:
         used(photographs)
 
 
-def test_no_home_is_no_hindrance_where_the_capture_can_be_written(
-    photographs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_home_is_no_hindrance_beside_the_capture(photographs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_home() -> Path:
         raise RuntimeError("Could not determine home directory.")
 

@@ -52,20 +52,16 @@ def make_camera(distance: float = 6.0, width: int = 64, height: int = 48) -> Cam
 
 @pytest.fixture(scope="session")
 def surfels():
-    """make(count, kind="sv", seed=0) -> the parameters of docs/overview.md."""
     return make_surfels
 
 
 @pytest.fixture(scope="session")
 def camera():
-    """make(distance) -> a camera on the z axis that looks at the origin."""
     return make_camera
 
 
 @pytest.fixture(scope="session")
 def scene():
-    """make(count, field=WaveField(), kind="sv") -> what `bake` takes."""
-
     def make(count: int = 200, field: object = "wave", kind: str = "sv", seed: int = 0) -> SimpleNamespace:
         field = WaveField() if field == "wave" else field
         surfels = make_surfels(count, kind, seed)

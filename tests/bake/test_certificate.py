@@ -124,9 +124,7 @@ def tuned(scene, truth: Reduced, request: pytest.FixtureRequest) -> Coded:
     return bake(made, *at, BakeOptions(format="uint8"), refine)
 
 
-def test_what_is_stated_is_true_and_other_integers_fail_behind_a_good_hash(
-    tuned: Coded, truth: Reduced, tmp_path: Path
-) -> None:
+def test_what_is_stated_is_true_and_other_integers_fail(tuned: Coded, truth: Reduced, tmp_path: Path) -> None:
     baked = tuned
     stated = baked.statistics.certificate
     cameras = [view.camera for view in photographs(truth)]

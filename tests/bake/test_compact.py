@@ -35,20 +35,16 @@ def rounded(truth: Reduced, views: list[View]) -> Rounded:
 
 
 def error(a: Stage, b: Stage, views: list[View]) -> float:
-    """Compute the mean squared difference of renders."""
     pictures = [(render(a, view.camera), render(b, view.camera)) for view in views]
     return sum(float((x.clamp(0, 1) - y.clamp(0, 1)).square().mean()) for x, y in pictures) / len(pictures)
 
 
 def from_photographs(baked: Stage, views: list[View]) -> float:
-    """Compute the mean squared difference from the photographs."""
     pictures = [(render(baked, view.camera).clamp(0, 1), view.image) for view in views]
     return sum(float((x - y).square().mean()) for x, y in pictures) / len(pictures)
 
 
-def test_it_costs_what_it_may_and_what_costs_less_takes_more_bytes(
-    truth: Reduced, views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_costs_less_takes_more_bytes(truth: Reduced, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compact, "MAX_LAMBDA", math.inf)  # the share alone decides
     sizes = []
     for share in (0.05, 0.4):
@@ -125,9 +121,7 @@ def test_without_views_the_reference_steps_are_taken(truth: Reduced) -> None:
     assert len(plain.rows) == len(truth.rows) and len(plain.scene.surfels["view_terms"]) > 0
 
 
-def test_texels_learn_through_their_coding_and_are_what_is_stored(
-    rounded: Rounded, views: list[View], tmp_path
-) -> None:
+def test_texels_learn_through_their_coding(rounded: Rounded, views: list[View], tmp_path) -> None:
     options = TuneOptions(steps=8, coded_steps=40, coded_every=5, val_every=4)
     coarse = replace(rounded, step=30.0)
     still = tune_atlas(coarse, views, BACKGROUND, replace(options, coded_steps=0))

@@ -32,7 +32,6 @@ def bilinear(bundle, surfel, u, v, extent=3.0):
 
 @pytest.mark.parametrize("format, tolerance", [("fp16", 1e-3), ("uint8", 4e-3), ("bc7", 2e-2)])
 def test_the_bundle_gives_the_field_back_between_texels(scene, tmp_path, format, tolerance):
-    """Bilinear samples inside the tiles match the analytic field."""
     made = scene(60)
     made.field.voxel = 0.02  # well below the wavelength, to exclude interpolation error
     export(bake_field(made, options=BakeOptions(format=format, tolerance=0)), tmp_path / "b")

@@ -28,6 +28,7 @@ from bitymi_ns.codec.pages import tile_means
 from bitymi_ns.ops import trace_cpu
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.views import MemoryBudget, View
+from tests.typed import Patch
 
 S = TypeVar("S", bound=Stage)
 BACKGROUND = torch.tensor([0.2, 0.4, 0.6])
@@ -35,7 +36,6 @@ OPTIONS = TuneOptions(steps=60, rate=0.3, val_every=4, coded_steps=0)
 
 
 def cameras() -> list[Camera]:
-    """Twelve views around the scene of conftest."""
     views = []
     for i in range(12):
         angle = torch.tensor(0.5236 * i)
@@ -65,7 +65,6 @@ def waving(made: Any, pixels_per_texel: float | None = None) -> Trained:
 
 
 def bounded(baked: S) -> S:
-    """Show no residual of faint fragments."""
     baked.scene.weight_bound = 0.02
     return baked
 
@@ -154,9 +153,7 @@ def test_coverage_of_several_views_is_their_sum(wrong: Reduced, views: list[View
 
 
 @pytest.mark.parametrize("patience", [2, 99])
-def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
-    wrong: Reduced, views: list[View], patience: int
-) -> None:
+def test_it_gives_up_without_a_gain(wrong: Reduced, views: list[View], patience: int) -> None:
     told: list[tuple[int, int]] = []
 
     def progress(step: str, done: int, total: int) -> None:
@@ -182,9 +179,7 @@ def test_it_gives_up_without_a_gain_and_its_progress_ends_with_it(
 
 
 @pytest.mark.parametrize("coded", [False, True])
-def test_the_texels_kept_are_those_of_the_best_evaluation(
-    wrong: Reduced, views: list[View], monkeypatch: pytest.MonkeyPatch, coded: bool
-) -> None:
+def test_the_best_texels_are_kept(wrong: Reduced, views: list[View], monkeypatch: Patch, coded: bool) -> None:
     """A run that gains, then loses, as its rate rises instead of falling."""
     seen: list[tuple[float, Tensor]] = []
     judge = TuningViews.psnr
@@ -218,9 +213,7 @@ def test_memory_for_the_views_does_not_change_the_result(wrong: Reduced, views: 
     assert all(torch.equal(r.texels, results[0].texels) for r in results)
 
 
-def test_a_view_with_many_fragments_is_traced_in_bands(
-    wrong: Reduced, views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_large_views_are_traced_in_bands(wrong: Reduced, views: list[View], monkeypatch: Patch) -> None:
     def learned() -> tuple[TuningView, Tensor]:
         drawn, texels = tuning_views(wrong, views[:1]), texels_of(wrong)
         drawn.step(0, texels, torch.ones(len(texels)), 1e-3, 0.2)
@@ -285,7 +278,6 @@ def test_options_out_of_range_are_refused(wrong: Reduced, views: list[View], bad
 
 
 def error(baked: Coded, views: list[View]) -> float:
-    """Compute the mean squared error of the stored scene."""
     return fmean(float((baked.scene.render(v.camera, BACKGROUND).rgb - v.image).square().mean()) for v in views)
 
 

@@ -35,7 +35,6 @@ def views(n: int, count: int = 9, seed: int = 0, spread: float = 1.0) -> tuple[t
 
 
 def exact_errors(kind, params, lean, means, seen, centers, opacity):
-    """Compute the largest weighted error at the views' directions, in float64: [n]."""
     found = torch.zeros(len(means), dtype=torch.float64)
     full = [params[name].double() for name in VIEW_COLORS[kind].names]
     for view, center in zip(seen, centers, strict=True):
@@ -176,7 +175,6 @@ def cameras(scene) -> list:
 
 @pytest.fixture
 def colored(scene):
-    """The scene with view colours of a kind, as they are trained."""
     return lambda kind: replace(
         (baked := waving(scene(COUNT)).unquantised()),
         surfels={**baked.surfels, **scene(COUNT, None, kind).surfels, "means": baked.surfels["means"]},

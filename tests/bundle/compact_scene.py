@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from bitymi_ns.bundle import write_bundle
-from bitymi_ns.codec.limits import EXTENTS
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import paged_texels
 from bitymi_ns.codec.quantise import Range, encode
@@ -52,9 +51,7 @@ def make_codes(
 
 
 def scene_of(codes: SceneCodes) -> BakedScene:
-    """Decode the scene without its atlas."""
     packing = pack(codes.surfels.sizes, codes.page_width, codes.page_rows)
-    assert EXTENTS[0] < 3.0 < EXTENTS[1]
     return BakedScene(
         codes.surfels.surfels(),
         codes.surfels.kind,
@@ -66,7 +63,6 @@ def scene_of(codes: SceneCodes) -> BakedScene:
 
 
 def pages_of(codes: SceneCodes) -> tuple[np.ndarray, Packing]:
-    """Decode the texels to pages [layers, height, width, C], with their packing."""
     packing, alphas = pack(codes.surfels.sizes, codes.page_width, codes.page_rows), codes.texels.alphas()
     texels = codes.texels.texels()
     return paged_texels(texels if alphas is None else torch.cat([texels, alphas[:, None]], 1), packing).numpy(), packing
@@ -83,7 +79,6 @@ def earlier(version: str) -> dict[str, dict[str, bytes]]:
 
 
 def write_earlier(version: str, folder: Path) -> Path:
-    """Write the files of such a bundle."""
     folder.mkdir()
     for file, data in earlier(version)["files"].items():
         (folder / file).write_bytes(data)

@@ -24,7 +24,6 @@ def signed(info: Mapping[str, Any], files: Mapping[str, bytes] | None = None) ->
 
 
 def amend(folder: Path, change: Callable[[dict[str, Any]], object] = lambda info: None) -> None:
-    """Apply change(bundle.json) and write it with current hashes and digest."""
     info = json.loads((folder / "bundle.json").read_text())
     files = {name: (folder / name).read_bytes() for name in info["files"] if (folder / name).exists()}
     info = json.loads(signed(info, files))

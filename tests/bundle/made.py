@@ -11,7 +11,6 @@ from tests.ops.test_view_color import lean_parameters
 
 
 def make(surfels, folder, kind="sv", format="uint8", count=6, lean=False, alpha=False, **kwargs):
-    """Write a bundle of a few surfels and random texels; returns its contents."""
     params = surfels(count, kind)
     if lean:
         params = {k: v for k, v in params.items() if k not in VIEW_COLORS[kind].names}

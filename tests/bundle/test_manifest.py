@@ -114,7 +114,6 @@ def test_the_limits_keep_colours_below_the_stated_bound():
 
 
 def quick(action: Callable[[], object]) -> None:
-    """Fail if an action takes time quadratic in the size."""
     begin = time.process_time()
     action()
     assert time.process_time() - begin < 2

@@ -51,7 +51,6 @@ def test_views_and_notes_are_read() -> None:
 
 
 def change(path: str, value: Any, file: Any = NOTES) -> bytes:
-    """Return a file with another value at a path."""
     notes = copy.deepcopy(file)
     *keys, last = (int(key) if key.isdigit() else key for key in path.split("."))
     at: Any = notes

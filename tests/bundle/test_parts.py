@@ -18,6 +18,7 @@ from bitymi_ns.cli import main
 from tests.bundle.compact_scene import make_codes, write_compact
 from tests.bundle.damage import amend
 from tests.bundle.test_read import peak
+from tests.typed import Patch, Printed
 
 PREVIEW = bytes(3000)
 
@@ -58,9 +59,7 @@ PLACED = {
         *((what, name) for what in ("pipe", "sparse") for name in ("bundle.json", "texels.bin", "preview.jpg")),
     ],
 )
-def test_what_is_no_regular_file_of_the_stated_size_is_refused_by_all_that_read_bundles(
-    what: str, name: str, folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_irregular_parts_are_refused_by_all(what: str, name: str, folder: Path, capsys: Printed) -> None:
     (folder / name).unlink()
     PLACED[what](folder / name)
     out, begin = str(folder.parent / "out"), time.perf_counter()
@@ -82,9 +81,7 @@ def test_what_is_no_regular_file_of_the_stated_size_is_refused_by_all_that_read_
 
 
 @pytest.mark.parametrize("what", ["zero", "pipe", "linked pipe", "folder", "loop", "nothing"])
-def test_neither_is_a_bundle_in_one_file_anything_but_a_regular_file(
-    what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_file_has_to_be_a_regular_file(what: str, tmp_path: Path, capsys: Printed) -> None:
     path = tmp_path / "x" / "b.bitymi"
     path.parent.mkdir()
     PLACED[what](path)
@@ -120,7 +117,6 @@ def test_a_large_file_beside_the_scene_is_not_taken_into_memory(folder: Path, tm
 
 
 def entries(path: Path, count: int, large: bool = False) -> None:
-    """Write a ZIP whose directory lists `count` empty parts."""
     one = struct.pack("<4s6H3L5H2L", b"PK\1\2", 20, 20, 0, 0, 0, 0, 0, 0, 0, 5, 0, 0, 0, 0, 0, 0)
     directory = b"".join(one + b"%05x" % (k % 16**5) for k in range(count))
     end = (b"PK\5\6", 0, 0, min(count, 0xFFFF), min(count, 0xFFFF), len(directory), 0, 0)
@@ -195,7 +191,7 @@ def test_a_damaged_container_is_read_as_the_page_reads_it(kind: str, tmp_path: P
                 assert parts.read(name, 1 << 20).decode() == text
 
 
-def test_a_file_beyond_four_gigabytes_is_read(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_beyond_four_gigabytes_is_read(folder: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 100)  # beyond which ZIP64 records are written
     write_single(folder, tmp_path / "b.bitymi")
     assert b"PK\6\6" in (tmp_path / "b.bitymi").read_bytes()

@@ -39,7 +39,6 @@ def sparse(folder: Path, name: str, size: int) -> None:
 
 
 def peak(action) -> int:
-    """Measure the peak memory of Python during an action."""
     tracemalloc.start()
     try:
         action()
@@ -163,9 +162,7 @@ COLUMNS = [
 
 
 @pytest.mark.parametrize("kind, lean, element, column, good, bad", COLUMNS, ids=lambda value: str(value))
-def test_values_beyond_their_limits_are_refused_by_column_and_row(
-    surfels, tmp_path, kind, lean, element, column, good, bad
-):
+def test_values_beyond_limits_are_refused_by_column_and_row(surfels, tmp_path, kind, lean, element, column, good, bad):
     folder = make(surfels, tmp_path / "b", kind, lean=lean, alpha=column == "alpha")
     change_columns(folder, lambda columns: columns[column].__setitem__(2, good), element)
     read_bundle(folder)
@@ -174,23 +171,20 @@ def test_values_beyond_their_limits_are_refused_by_column_and_row(
         read_bundle(folder)
 
 
-def test_alphas_that_are_missing_or_out_of_range_are_refused(surfels, tmp_path):
-    folder = make(surfels, tmp_path / "b", format="fp16", alpha=True)
-    change_texel(folder, 3, -0.5)
-    with pytest.raises(BundleError, match=r"atlas.ktx2: the alpha of the texel \(5, 3\) of layer 0 is not from 0 to 2"):
+@pytest.mark.parametrize(
+    "alpha, texel, told, change, reason",
+    [
+        (True, (3, -0.5), "the alpha of the texel .* 0 to 2", lambda c: c.pop("alpha"), "the column alpha is missing"),
+        (False, (1, 300), "the texel .* -256 to 256", lambda c: c["rot_0"].__setitem__(4, 1.5), "length 1 in row 4"),
+    ],
+)
+def test_texels_and_columns_out_of_range_are_refused(surfels, tmp_path, alpha, texel, told, change, reason):
+    folder = make(surfels, tmp_path / "b", format="fp16", alpha=alpha)
+    change_texel(folder, *texel)
+    with pytest.raises(BundleError, match=rf"atlas.ktx2: {told.replace('.*', r'.5, 3. of layer 0 is not from')}"):
         read_bundle(folder)
-    change_columns(folder, lambda columns: columns.pop("alpha"))
-    with pytest.raises(BundleError, match="the column alpha is missing"):
-        read_bundle(folder)
-
-
-def test_rotations_that_are_not_unit_and_texels_beyond_their_limit_are_refused(surfels, tmp_path):
-    folder = make(surfels, tmp_path / "b", format="fp16")
-    change_texel(folder, 1, 300)
-    with pytest.raises(BundleError, match=r"atlas.ktx2: the texel \(5, 3\) of layer 0 is not from -256 to 256"):
-        read_bundle(folder)
-    change_columns(folder, lambda columns: columns["rot_0"].__setitem__(4, 1.5))
-    with pytest.raises(BundleError, match="rot_0 to rot_3 are not of length 1 in row 4"):
+    change_columns(folder, change)
+    with pytest.raises(BundleError, match=reason):
         read_bundle(folder)
 
 

@@ -24,7 +24,6 @@ def single(tmp_path: Path) -> bytes:
 
 
 def middle_of(single: bytes, name: str) -> int:
-    """Return the offset of the middle of a part."""
     entry = zipfile.ZipFile(io.BytesIO(single)).getinfo(name)
     return entry.header_offset + 30 + len(name) + entry.file_size // 2
 

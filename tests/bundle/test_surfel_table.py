@@ -2,11 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bundle.surfel_table import (
-    from_columns,
-    mean_view_color,
-    to_columns,
-)
+from bitymi_ns.bundle.surfel_table import from_columns, mean_view_color, to_columns
 from bitymi_ns.ops import VIEW_COLORS
 from bitymi_ns.ops.constants import SH_C0
 from bitymi_ns.ops.view_kinds import kind_of

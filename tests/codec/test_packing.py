@@ -14,7 +14,6 @@ sizes = hnp.arrays(np.int32, st.tuples(st.integers(0, 120), st.just(2)), element
 
 
 def painted(packing):
-    """Count the tiles that own each texel."""
     count = np.zeros((packing.layers, packing.height, packing.width), dtype=int)
     for x, y, layer, r_u, r_v in packing.tiles:
         count[layer, y : y + r_v, x : x + r_u] += 1

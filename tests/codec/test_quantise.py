@@ -14,7 +14,6 @@ def paint(packing, value):
 
 
 def listed(packing, texels):
-    """Gather the tiles' texels: [T, 3]."""
     return np.concatenate([texels[la, y : y + h, x : x + w].reshape(-1, 3) for x, y, la, w, h in packing.tiles])
 
 

@@ -30,7 +30,6 @@ def cut_scene(count: int = 12, as_bytes: bool = True, **more) -> BakedScene:
 
 
 def coverage(scene: BakedScene, camera: Camera) -> torch.Tensor:
-    """Sum the blending weights of the projection's fragments: [H, W, 1]."""
     projection = ops.project(*(scene.surfels[name] for name in GEOMETRY), camera, scene.near)
     fragments = ops.trace(replace(projection, alpha=texel_alpha(scene)))
     total = torch.zeros(camera.height * camera.width).index_add(0, fragments.pixel.long(), fragments.weight)

@@ -18,7 +18,6 @@ STEPS = 60
 
 
 def small_run(data: Path, output: Path, name: str = "run", method: str = "bitymi") -> BitymiTrainerConfig:
-    """Configure a run of a few seconds."""
     config = method_config(method).config
     config.output_dir, config.experiment_name, config.timestamp = output, "room", name
     config.pipeline.datamanager.data = data
@@ -34,8 +33,6 @@ def small_run(data: Path, output: Path, name: str = "run", method: str = "bitymi
 
 @pytest.fixture
 def start(room: Path, tmp_path: Path) -> Callable[..., BitymiTrainerConfig]:
-    """Return a function that configures a small run for `ns_train.main`."""
-
     def make(**options: Any) -> BitymiTrainerConfig:
         return small_run(options.pop("data", room), tmp_path / "outputs", **options)
 
@@ -71,7 +68,6 @@ def field_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTra
 
 @pytest.fixture(scope="session")
 def field_bundle(field_run: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """That run as a bundle. Not to be changed."""
     folder = tmp_path_factory.mktemp("bundles") / "field-bc7"
     run_export(field_run, folder, tolerance=TOLERANCE, finetune_steps=0)
     return folder

@@ -13,7 +13,6 @@ TOLERANCE = 0.02
 
 
 def run_export(config: BitymiTrainerConfig, folder: Path, **options: Any) -> None:
-    """Export a run, by default with BC7 and without polish, which is faster."""
     given = {"polish_steps": 0, "format": "bc7", **options}
     ExportAtlas(load_config=config.get_base_dir() / "config.yml", output_dir=folder, **given).main()
 

@@ -18,7 +18,6 @@ def checkpoint(config: BitymiTrainerConfig, step: int) -> dict[str, Any]:
 
 
 def a_run_of(trained: BitymiTrainerConfig, folder: Path) -> Path:
-    """Copy the run to another folder and return it."""
     return Path(shutil.copytree(trained.get_base_dir(), folder / "run"))
 
 
@@ -27,7 +26,6 @@ def config_of(folder: Path) -> BitymiTrainerConfig:
 
 
 def rewrite(folder: Path, change: Callable[[BitymiTrainerConfig], None]) -> None:
-    """Apply `change` to the config.yml of a run."""
     config = config_of(folder)
     change(config)
     (folder / "config.yml").write_text(yaml.dump(config))

@@ -14,9 +14,7 @@ PSNR = 30.0
 
 
 @pytest.mark.slow
-def test_frames_of_a_recorded_path_are_the_pictures_of_the_page(
-    bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_of_a_path_are_the_pages_pictures(bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from bitymi_ns.view import site_of
 
     file, shots = tmp_path / "camera_path.json", [tmp_path / f"{k}.png" for k in range(2)]

@@ -2,17 +2,15 @@
 
 from collections.abc import Callable
 
-import pytest
 import torch
 from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
+from tests.typed import Printed
 
 
-def test_a_diverging_run_says_so_and_leaves_a_finite_scene(
-    start: Callable[..., BitymiTrainerConfig], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_diverging_run_leaves_a_finite_scene(start: Callable[..., Run], capsys: Printed) -> None:
     config = start()
     train = config.pipeline.model.train
     train.lr = train.lr.times(1000.0)

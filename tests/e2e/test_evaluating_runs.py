@@ -14,9 +14,7 @@ from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.runs import a_run_of, rewrite
 
 
-def test_evaluation_refuses_a_checkpoint_that_is_damaged_or_missing(
-    trained: BitymiTrainerConfig, tmp_path: Path
-) -> None:
+def test_evaluation_refuses_a_damaged_or_missing_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
     folder = a_run_of(trained, tmp_path)
     newest = folder / "nerfstudio_models" / "step-000000059.ckpt"
     newest.write_bytes(newest.read_bytes()[:1000])
@@ -49,10 +47,7 @@ def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTra
     ("options", "message"),
     [
         ({"output_path": Path("e")}, "--output-path must end in .json, e does not"),
-        (
-            {"render_output_path": Path(__file__)},
-            r"_runs.py is not a folder: .* \(--render-output-path\)",
-        ),
+        ({"render_output_path": Path(__file__)}, r"_runs.py is not a folder: .* \(--render-output-path\)"),
     ],
 )
 def test_paths_that_cannot_be_written_are_refused_before_the_scene_is_loaded(

@@ -16,10 +16,11 @@ from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export import target
 from bitymi_ns.plugin.run.bundle_model import RENDERER
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from bitymi_ns.scene.baked import FAST
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 from tests.e2e.runs import a_run_of, rewrite
+from tests.typed import Patch, Printed
 
 
 def test_a_bundle_has_its_files_and_states_what_the_bake_cost(bundle: Path) -> None:
@@ -38,9 +39,7 @@ def test_a_bundle_has_its_files_and_states_what_the_bake_cost(bundle: Path) -> N
     assert torch.tensor(info["world"]["transform"]).shape == (3, 4)
 
 
-def test_stock_evaluation_of_checkpoint_and_bundle_agree(
-    trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path
-) -> None:
+def test_evaluations_of_checkpoint_and_bundle_agree(trained: Run, bundle: Path, tmp_path: Path) -> None:
     neural = evaluate(trained.get_base_dir() / "config.yml", tmp_path / "neural.json")
     baked = evaluate(bundle / "config.yml", tmp_path / "baked.json")
     for name in ("psnr", "ssim", "surfels", "render_ms", "fragments_per_pixel"):
@@ -53,9 +52,7 @@ def test_stock_evaluation_of_checkpoint_and_bundle_agree(
     assert ("lpips" in neural) == ("lpips" in baked)
 
 
-def test_a_bundle_needs_neither_checkpoint_nor_its_old_place(
-    bundle: Path, copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bundle_may_be_moved(bundle: Path, copied: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     rewrite(copied, lambda config: setattr(config.pipeline.model, "bundle", Path("/no/longer/there")))
     monkeypatch.chdir(tmp_path)
     _, pipeline, path, _ = eval_setup(Path("elsewhere") / "config.yml")
@@ -66,7 +63,7 @@ def test_a_bundle_needs_neither_checkpoint_nor_its_old_place(
     assert outputs["rgb"].shape == (36, 48, 3) and {"depth", "normal", "overdraw"} <= outputs.keys()
 
 
-def test_extras_are_written_beside_the_bundle(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+def test_extras_are_written_beside_the_bundle(trained: Run, tmp_path: Path) -> None:
     (tmp_path / "b.extras").mkdir()
     (tmp_path / "b.extras" / "mine").touch()
     with pytest.raises(SystemExit):
@@ -80,7 +77,7 @@ def test_extras_are_written_beside_the_bundle(trained: BitymiTrainerConfig, tmp_
         assert stated[kind]["count"] > 0 and stated[kind]["bytes"] > 0
 
 
-def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainerConfig], tmp_path: Path) -> None:
+def test_a_scene_without_texture_has_no_atlas(start: Callable[..., Run], tmp_path: Path) -> None:
     config = start(method="bitymi-notexture")
     config.max_num_iterations = 3
     ns_train.main(config)
@@ -90,7 +87,7 @@ def test_a_scene_without_texture_has_no_atlas(start: Callable[..., BitymiTrainer
     assert evaluate(tmp_path / "plain" / "config.yml", tmp_path / "plain.json")["atlas_bytes"] == 0
 
 
-def test_the_estimate_of_a_bundle_is_generous(trained: BitymiTrainerConfig, bundle: Path) -> None:
+def test_the_estimate_of_a_bundle_is_generous(trained: Run, bundle: Path) -> None:
     size = sum(path.stat().st_size for path in bundle.iterdir())
     config = trained.get_base_dir() / "config.yml"
     kinds = [(name, exact) for name in ("bc7", "fp16") for exact in (0, 1)]
@@ -98,9 +95,7 @@ def test_the_estimate_of_a_bundle_is_generous(trained: BitymiTrainerConfig, bund
     assert size < needed[0] < needed[1] < needed[3] and needed[0] < needed[2]
 
 
-def test_texels_that_learned_in_training_become_the_atlas(
-    trained: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_texels_that_learned_are_the_atlas(trained: Run, tmp_path: Path, capsys: Printed) -> None:
     folder = tmp_path / "b [bold]" / "[" / "x]"  # brackets in a path are not console markup
     run_export(trained, folder, polish_steps=None, tolerance=0.2)  # default number of steps
     bundle, checks = check_files(folder)
@@ -119,7 +114,7 @@ def test_texels_that_learned_in_training_become_the_atlas(
     assert exact["held_out"]["psnr_baked_against_neural"] > 33  # BC7 with alpha
 
 
-def test_a_bundle_is_drawn_by_the_renderer_that_is_asked_for(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bundle_is_drawn_by_the_renderer_that_is_asked_for(copied: Path, monkeypatch: Patch) -> None:
     def least() -> float:
         return eval_setup(copied / "config.yml")[1].model._renderer.scene.transmittance_min
 
@@ -131,9 +126,7 @@ def test_a_bundle_is_drawn_by_the_renderer_that_is_asked_for(copied: Path, monke
         least()
 
 
-def test_a_run_is_found_beside_its_configuration(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_is_found_by_its_config(trained: Run, tmp_path: Path, monkeypatch: Patch) -> None:
     folder = a_run_of(trained, tmp_path)
     # as recorded by default: relative to the folder of the training
     rewrite(folder, lambda config: setattr(config, "output_dir", Path("outputs")))

@@ -12,7 +12,7 @@ from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
 
 
-def test_it_is_the_default_smaller_and_shows_the_same(
+def test_it_is_the_default(
     trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "b"

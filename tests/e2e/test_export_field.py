@@ -10,13 +10,12 @@ from bitymi_ns.bundle import check_files
 from bitymi_ns.cli import main
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.trained import check_run
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
+from tests.typed import Printed
 
 
-def test_the_scene_is_polished_and_fine_tuned(
-    field_run: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_polished_and_tuned(field_run: Run, tmp_path: Path, capsys: Printed) -> None:
     run_export(field_run, tmp_path / "b", tolerance=TOLERANCE, polish_steps=30, finetune_steps=8)
     statistics = json.loads((tmp_path / "b" / "bundle.json").read_text())["statistics"]
     polished, tuned = statistics["polish"], statistics["finetune"]
@@ -40,8 +39,8 @@ def test_the_scene_is_polished_and_fine_tuned(
     assert "the surfels learned after the bake" in found["error of the view colours"].detail
 
 
-def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(
-    field_run: BitymiTrainerConfig, field_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_exact_keeps_everything_and_others_say_less(
+    field_run: Run, field_bundle: Path, tmp_path: Path, capsys: Printed
 ) -> None:
     run_export(field_run, tmp_path / "exact", exact=True)
     printed = capsys.readouterr().out
@@ -59,9 +58,7 @@ def test_exact_keeps_everything_and_a_tolerance_states_what_it_saves(
     assert certificate["within"] + certificate["beyond"] == default["surfels"]["kept"]
 
 
-def test_verify_compares_a_bundle_with_its_run(
-    field_run: BitymiTrainerConfig, field_bundle: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_verify_compares_with_the_run(field_run: Run, field_bundle: Path, capsys: Printed) -> None:
     run = field_run.get_base_dir()
     assert main(["verify", str(field_bundle), "--run", str(run / "config.yml")]) == 0
     assert "PSNR against the trained scene" in capsys.readouterr().out

@@ -13,12 +13,13 @@ from nerfstudio.utils.eval_utils import eval_setup
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export import command, target
 from bitymi_ns.plugin.export.command import ExportAtlas
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from tests.e2e.exports import run_export
 from tests.e2e.runs import rewrite
+from tests.typed import Patch
 
 
-def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerConfig, copied: Path) -> None:
+def test_an_existing_bundle_is_replaced_only_on_request(trained: Run, copied: Path) -> None:
     before = (copied / "bundle.json").read_bytes()
     with pytest.raises(InputError, match="is there already.*--overwrite True"):
         run_export(trained, copied)
@@ -28,7 +29,7 @@ def test_an_existing_bundle_is_replaced_only_on_request(trained: BitymiTrainerCo
     assert info["statistics"]["options"]["tolerance"] == 2 and "held_out" not in info["statistics"]
 
 
-def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+def test_a_folder_that_is_no_bundle_is_never_replaced(trained: Run, tmp_path: Path) -> None:
     (tmp_path / "precious.txt").write_text("x")
     with pytest.raises(InputError, match="is not a bundle"):
         run_export(trained, tmp_path, overwrite=True)
@@ -51,12 +52,12 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: BitymiTrainerConf
         ({"page_width": 100}, "page width must be a power of two"),
         ({"r_max": 48}, "r_max must be a power of two"),
         ({"r_max": 8192}, "do not fit pages"),
-        ({"seed": -1}, "seed must not be negative"),
+        ({"seed": -1}, "seed must be greater than or equal to 0, not -1"),
         ({"r_min": 5}, "cannot be baked: .*power of two"),
     ],
 )
-def test_options_out_of_range_are_found_before_the_work(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: Any, message: str
+def test_wrong_options_are_found_early(
+    trained: Run, tmp_path: Path, monkeypatch: Patch, options: Any, message: str
 ) -> None:
     monkeypatch.setattr(command, "load_trained", None)  # not called
     with pytest.raises(InputError, match=message):
@@ -64,16 +65,14 @@ def test_options_out_of_range_are_found_before_the_work(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_options_of_fields_are_refused_for_trained_texels(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+def test_options_of_fields_are_refused_for_trained_texels(trained: Run, tmp_path: Path) -> None:
     for options in ({"r_max": 16}, {"extent": 1.5}, {"r_min": 8, "local_voxel": False}):
         with pytest.raises(InputError, match=f"cannot be baked: .*{next(iter(options))}.* for a field.*tolerance"):
             run_export(trained, tmp_path / "b", **options)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_place_that_will_not_do_is_found_before_the_work(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unusable_places_are_found_early(trained: Run, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(command, "load_trained", None)  # not called
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="b cannot be written: .*file is not a folder.*--output-dir"):
@@ -91,9 +90,7 @@ def test_a_place_that_will_not_do_is_found_before_the_work(
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_missing_encoder_is_named(
-    trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_encoder_is_named(trained: Run, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
     with pytest.raises(InputError, match="pip install ispc_texcomp"):
         run_export(trained, tmp_path / "b")

@@ -25,6 +25,7 @@ from tests.captures import colmap_model, found_poses, printed
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
 from tests.e2e.runs import a_run_of, checkpoint, config_of, different, rewrite
+from tests.typed import Patch, Printed
 
 STEPS = 4
 
@@ -75,7 +76,7 @@ def never(*arguments: Any) -> Any:
 
 
 @pytest.fixture
-def shoot(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Shot]:
+def shoot(room: Path, tmp_path: Path, monkeypatch: Patch) -> Callable[..., Shot]:
     """Return a function that trains on photographs, after which pose estimation is disabled."""
 
     def make(upright: bool = False, sfm: SfmSettings | None = None, **options: Any) -> Shot:
@@ -90,7 +91,6 @@ def shoot(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callab
 
 
 def seen(pipeline: Any) -> dict[str, torch.Tensor]:
-    """Return names, poses and points as read."""
     manager = pipeline.datamanager
     result = {"points": manager.train_dataparser_outputs.metadata["points3D_xyz"]}
     for dataset in (manager.train_dataset, manager.eval_dataset):
@@ -100,8 +100,8 @@ def seen(pipeline: Any) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("upright", [False, True], ids=["as they are", "upright copies"])
-def test_evaluation_has_the_poses_of_the_training(
-    shoot: Callable[..., Shot], upright: bool, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_evaluation_has_training_poses(
+    shoot: Callable[..., Shot], upright: bool, capsys: Printed, monkeypatch: Patch
 ) -> None:
     shot = shoot(upright)
     monkeypatch.setattr("bitymi_ns.capture.poses.find_poses", shot.find_poses)
@@ -126,9 +126,7 @@ def test_evaluation_has_the_poses_of_the_training(
     assert "frame_00099.png (blurred)" in text and ("frame_00000_new.png" in text) is not upright
 
 
-def test_pictures_that_can_go_take_no_space_where_they_can_be_linked(
-    shoot: Callable[..., Shot], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_linked_pictures_take_no_space(shoot: Callable[..., Shot], monkeypatch: Patch, tmp_path: Path) -> None:
     shot = shoot(upright=True)
     copy, link = sorted((shot.run / POSES / "images").iterdir())[:2]
     assert copy.samefile(shot.images / copy.name) and not copy.is_symlink()
@@ -146,9 +144,7 @@ def test_pictures_that_can_go_take_no_space_where_they_can_be_linked(
     assert not copy.samefile(shot.images / copy.name) and link.is_symlink()
 
 
-def test_poses_that_cannot_be_kept_do_not_stop_the_run(
-    shoot: Callable[..., Shot], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_poses_not_kept_do_not_stop_the_run(shoot: Callable[..., Shot], monkeypatch: Patch, capsys: Printed) -> None:
     def full(*arguments: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -175,9 +171,7 @@ def test_a_resumed_run_goes_on_in_the_same_world(shoot: Callable[..., Shot]) -> 
     eval_setup(config.get_base_dir() / "config.yml")
 
 
-def test_options_for_poses_that_are_not_found_anew(
-    shoot: Callable[..., Shot], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_for_poses_not_found_anew(shoot: Callable[..., Shot], capsys: Printed) -> None:
     shot = shoot(sfm=SfmSettings(mapper="global", max_features=500))
 
     def go_on(name: str, sfm: SfmSettings) -> str:
@@ -232,9 +226,7 @@ def test_a_run_that_was_moved_and_a_capture_with_other_files_by_now(shoot: Calla
     assert different(poses, seen(eval_setup(moved / "config.yml")[1])) == []
 
 
-def test_a_bundle_has_the_world_of_its_run(
-    shoot: Callable[..., Shot], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bundle_has_its_runs_world(shoot: Callable[..., Shot], tmp_path: Path, capsys: Printed) -> None:
     shot = shoot()
     shot.spoil()
     poses = seen(load_trained(shot.run / "config.yml")[1])
@@ -270,9 +262,7 @@ DAMAGED = ["", "[]", "{}", json.dumps({"origin": {"kind": "photographs"}, "left_
            json.dumps({"origin": {"kind": "x", "path": ".", "photographs": None}, "left_out": {}})]  # fmt: skip
 
 
-def test_poses_that_are_damaged_are_named_and_new_and_earlier_runs_find_their_own(
-    shoot: Callable[..., Shot], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damaged_poses_are_named_and_other_runs_find_their_own(shoot: Callable[..., Shot], monkeypatch: Patch) -> None:
     shot = shoot()
     origin = shot.run / POSES / "origin.json"
     config = config_of(shot.run)

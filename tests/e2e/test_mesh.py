@@ -14,7 +14,8 @@ from bitymi_ns.bundle.manifest import dump
 from bitymi_ns.bundle.world import World
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.mesh import ExportMesh
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
+from tests.typed import Patch, Printed
 
 
 def mesh_of(load_config: Path, folder: Path, **options: object) -> open3d.geometry.TriangleMesh:
@@ -23,14 +24,13 @@ def mesh_of(load_config: Path, folder: Path, **options: object) -> open3d.geomet
 
 
 def place(bundle: Path, transform: np.ndarray) -> None:
-    """Move the bundle within the capture's frame."""
     info = read_bundle(bundle).info
     info.world = info.world.replace(transform=tuple(map(tuple, transform.tolist())))
     (bundle / "bundle.json").write_bytes(dump(info))
 
 
 @pytest.mark.slow
-def test_a_run_and_its_bundle_give_the_same_surface(trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path) -> None:
+def test_a_run_and_its_bundle_give_the_same_surface(trained: Run, bundle: Path, tmp_path: Path) -> None:
     run = mesh_of(trained.get_base_dir() / "config.yml", tmp_path / "run", frame="scene")
     baked = mesh_of(bundle / "config.yml", tmp_path / "bundle", frame="scene")
     assert len(run.triangles) > 100 and run.has_vertex_colors()
@@ -51,9 +51,7 @@ def test_a_run_and_its_bundle_give_the_same_surface(trained: BitymiTrainerConfig
     assert (folder / "mesh.ply").read_bytes() == before
 
 
-def test_a_mesh_of_a_crop_has_no_more(
-    copied: Path, trained: BitymiTrainerConfig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mesh_of_a_crop(copied: Path, trained: Run, tmp_path: Path, capsys: Printed) -> None:
     low = float(read_bundle(copied).scene.surfels["means"][:, 2].median())
     crop = {"floor": {"normal": [0, 0, 1], "offset": low}}
     notes = {"format": "bitymi-notes", "version": 2, "views": [], "notes": [], "crop": crop}
@@ -66,7 +64,7 @@ def test_a_mesh_of_a_crop_has_no_more(
 
 
 @pytest.mark.slow
-def test_a_closed_mesh_is_closed(bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_closed_mesh_is_closed(bundle: Path, tmp_path: Path, capsys: Printed) -> None:
     mesh_of(bundle / "config.yml", tmp_path / "mesh", watertight=True, triangles=5000)
     shape = trimesh.load_mesh(tmp_path / "mesh" / "mesh.ply")
     assert shape.is_watertight and shape.is_winding_consistent and shape.volume > 0 and 500 < len(shape.faces) <= 5000
@@ -74,9 +72,7 @@ def test_a_closed_mesh_is_closed(bundle: Path, tmp_path: Path, capsys: pytest.Ca
 
 
 @pytest.mark.slow
-def test_a_mesh_on_a_map_states_its_origin(
-    copied: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mesh_on_a_map(copied: Path, bundle: Path, tmp_path: Path, capsys: Printed) -> None:
     """A capture in map coordinates gives the same sizes and shapes."""
     turn = np.array(read_bundle(copied).info.world.transform)
     turn[:, 3] -= turn[:, :3] @ (500123.0, 4649876.0, 312.0)
@@ -100,9 +96,7 @@ def test_a_mesh_on_a_map_states_its_origin(
         assert np.abs(middle - home.bounds.mean(0) - (500123.0, 4649876.0, 312.0)).max() < 0.01
 
 
-def test_a_capture_that_is_bent_names_the_scenes_frame(
-    trained: BitymiTrainerConfig, copied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bent_capture_names_the_scenes_frame(trained: Run, copied: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     bent = World(np.diag([1.0, 2.0, 1.0, 1.0])[:3], 1.0)
     place(copied, bent.transform)
     monkeypatch.setattr("bitymi_ns.plugin.export.mesh.world_of", lambda datamanager: bent)
@@ -113,7 +107,7 @@ def test_a_capture_that_is_bent_names_the_scenes_frame(
 
 
 @pytest.mark.slow
-def test_what_stands_in_the_place_of_a_mesh_is_kept(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+def test_what_stands_in_the_place_of_a_mesh_is_kept(trained: Run, tmp_path: Path) -> None:
     config, folder = trained.get_base_dir() / "config.yml", tmp_path / "mesh"
     folder.mkdir()
     for name in ("notes.txt", "mesh.ply", "mesh.mtl"):

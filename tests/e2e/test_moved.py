@@ -22,16 +22,16 @@ from bitymi_ns import cli
 from bitymi_ns.bundle import strict_json
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.hooks import REFUSED
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from bitymi_ns.plugin.run.render import OUTPUTS
 from bitymi_ns.sample import generate
 from tests.e2e.exports import evaluate
 from tests.e2e.runs import a_run_of, rewrite
+from tests.typed import Patch, Printed
 
 
 @pytest.fixture
 def alone(copied: Path) -> Path:
-    """A bundle without its capture."""
     for part in ("datamanager", "datamanager.dataparser"):
         of = attrgetter(f"pipeline.{part}")
         rewrite(copied, lambda config, of=of: setattr(of(config), "data", Path("/no/longer/there")))
@@ -81,7 +81,7 @@ def test_the_cameras_of_a_bundle_alone_are_drawn(alone: Path, tmp_path: Path, na
         render.DatasetRender(split="test", **options).main()
 
 
-def test_the_viewer_needs_a_bundle_alone(alone: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_viewer_needs_a_bundle_alone(alone: Path, monkeypatch: Patch, tmp_path: Path) -> None:
     shown = []
 
     def start_viewer(config: Any, pipeline: Any, step: int) -> None:
@@ -95,9 +95,7 @@ def test_the_viewer_needs_a_bundle_alone(alone: Path, monkeypatch: pytest.Monkey
     assert not (tmp_path / "no").exists()
 
 
-def test_what_needs_photographs_says_how_to_name_them(
-    alone: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_missing_photographs_can_be_named(alone: Path, room: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     with pytest.raises(InputError, match="/no/longer/there/frame.* the capture is gone. .* `BITYMI_DATA=/where/it/is`"):
         evaluate(alone / "config.yml", tmp_path / "out.json")
     moved = Path(shutil.copytree(room, tmp_path / "moved"))
@@ -108,9 +106,7 @@ def test_what_needs_photographs_says_how_to_name_them(
         eval_setup(alone / "config.yml")
 
 
-def test_a_bundle_is_compared_with_its_own_capture_alone(
-    bundle: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bundle_needs_its_own_capture(bundle: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     """Any other has cameras elsewhere, as has the same one in another frame."""
     other = generate(tmp_path / "other", views=8, width=48, height=36, seed=1)
     monkeypatch.setenv("BITYMI_DATA", str(other))
@@ -119,9 +115,7 @@ def test_a_bundle_is_compared_with_its_own_capture_alone(
         evaluate(copy / "config.yml", tmp_path / "out.json")
 
 
-def test_a_bundle_without_run_is_in_the_frame_of_its_captures_files(
-    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bundle_without_run_has_its_captures_frame(room: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     views, points, colors = bitymi_ns.load_capture(room)
     scene, log = bitymi_ns.train_scene(views, points, colors, steps=60, eval_views=views[:2])
     bitymi_ns.bake_scene(scene, views, tmp_path / "b")
@@ -132,12 +126,12 @@ def test_a_bundle_without_run_is_in_the_frame_of_its_captures_files(
 
 
 @pytest.mark.slow
-def test_a_run_whose_capture_was_moved(
-    trained: BitymiTrainerConfig,
+def test_a_runs_capture_was_moved(
+    trained: Run,
     room: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: Patch,
+    capsys: Printed,
 ) -> None:
     run = a_run_of(trained, tmp_path)
     rewrite(run, lambda config: setattr(config.pipeline.datamanager, "data", Path("/no/longer/there")))
@@ -156,16 +150,14 @@ def test_a_run_whose_capture_was_moved(
 
 
 @pytest.mark.parametrize("name", sorted(REFUSED))
-def test_commands_that_cannot_work_on_surfels(
-    name: str, bundle: Path, trained: BitymiTrainerConfig, tmp_path: Path
-) -> None:
+def test_commands_that_need_rays(name: str, bundle: Path, trained: Run, tmp_path: Path) -> None:
     folders = (bundle, trained.get_base_dir()) if name == "ExportGaussianSplat" else (bundle,)
     for folder in folders:
         with pytest.raises(InputError, match="ns-export .*bitymi extras"):
             getattr(exporter, name)(load_config=folder / "config.yml", output_dir=tmp_path).main()
 
 
-def test_a_refusal_ends_no_thread_of_the_viewer(bundle: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_refusal_ends_no_thread_of_the_viewer(bundle: Path, capsys: Printed) -> None:
     _, pipeline, _, _ = eval_setup(bundle / "config.yml")
     camera = pipeline.datamanager.eval_dataset.cameras[:1]
     seen = pipeline.model.get_outputs_for_camera(camera)
@@ -178,7 +170,7 @@ def test_a_refusal_ends_no_thread_of_the_viewer(bundle: Path, capsys: pytest.Cap
     assert capsys.readouterr().out.count("equirectangular cannot be rendered") == 1
 
 
-def test_a_crop_box_hides_surfels(bundle: Path, trained: BitymiTrainerConfig) -> None:
+def test_a_crop_box_hides_surfels(bundle: Path, trained: Run) -> None:
     box = OrientedBox.from_params((0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.8, 0.8, 0.8))
     for folder in (bundle, trained.get_base_dir()):
         _, pipeline, _, _ = eval_setup(folder / "config.yml")
@@ -190,7 +182,7 @@ def test_a_crop_box_hides_surfels(bundle: Path, trained: BitymiTrainerConfig) ->
         assert torch.equal(whole, again) and 0 < some.mean() < 0.9 * whole.mean() and not nothing.any()
 
 
-def test_a_bundle_is_drawn_with_its_crop(copied: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bundle_is_drawn_with_its_crop(copied: Path, monkeypatch: Patch) -> None:
     monkeypatch.setenv("BITYMI_CROP", "True")
     with pytest.raises(InputError, match=r"notes\.json hides no surfels: save a crop .* ask for it\.$"):
         eval_setup(copied / "config.yml")
@@ -208,9 +200,7 @@ def test_a_bundle_is_drawn_with_its_crop(copied: Path, monkeypatch: pytest.Monke
         eval_setup(copied / "config.yml")
 
 
-def test_photographs_through_a_lens_are_rendered(
-    bundle: Path, room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_lens_photographs_are_rendered(bundle: Path, room: Path, tmp_path: Path, monkeypatch: Patch) -> None:
     capture = Path(shutil.copytree(room, tmp_path / "room"))
     meta = json.loads((capture / "transforms.json").read_text())
     (capture / "transforms.json").write_text(json.dumps({**meta, "k1": 0.08, "k2": -0.01}))

@@ -15,10 +15,11 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run import callbacks
 from bitymi_ns.plugin.run.callbacks import FILE
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from tests.captures import add_masks, mixed_project, write_cloud
+from tests.typed import Patch, Printed
 
-Start = Callable[..., BitymiTrainerConfig]
+Start = Callable[..., Run]
 
 
 @pytest.fixture
@@ -26,12 +27,12 @@ def capture(room: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(room, tmp_path / "spoilt"))
 
 
-def curve(config: BitymiTrainerConfig) -> list[dict[str, Any]]:
+def curve(config: Run) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (config.get_base_dir() / FILE).read_text().splitlines()]
 
 
 @pytest.mark.slow
-def test_no_quality_is_reported_over_no_pixels(start: Start, capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_quality_is_reported_over_no_pixels(start: Start, capture: Path, capsys: Printed) -> None:
     add_masks(capture, lambda i: 0 if i in (0, 8) else 255)
     config = start(data=capture)
     config.steps_per_eval_image = config.steps_per_eval_all_images = 30
@@ -49,9 +50,7 @@ def test_points_that_no_view_sees(start: Start, capture: Path) -> None:
         ns_train.main(start(data=capture))
 
 
-def test_a_view_that_sees_none_of_the_points(
-    start: Start, room: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_view_without_points(start: Start, room: Path, monkeypatch: Patch, capsys: Printed) -> None:
     monkeypatch.setattr(callbacks, "views_without_surfels", lambda scene, cameras: [1])
     config = start()
     config.max_num_iterations = 2
@@ -61,9 +60,7 @@ def test_a_view_that_sees_none_of_the_points(
 
 
 @pytest.mark.slow
-def test_a_capture_of_several_cameras_trains_is_exported_and_evaluated(
-    start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_several_cameras_train_and_are_exported(start: Start, tmp_path: Path, capsys: Printed) -> None:
     """Landscape with distortion, portrait, and fisheye, in one COLMAP model."""
     mixed_project(tmp_path / "mixed")
     config = start(data=tmp_path / "mixed")

@@ -22,8 +22,9 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.mesh import ExportMesh
 from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.hooks import find_config
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from bitymi_ns.trust import python_command
+from tests.typed import Patch, Printed
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +34,7 @@ def packed(bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_folder_of_a_file_is_opened_by_nerfstudio(
-    packed: Path, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unpacked_folder_is_opened(packed: Path, bundle: Path, tmp_path: Path, capsys: Printed) -> None:
     folder = tmp_path / "room"
     assert cli.main(["unpack", str(packed), "--output", str(folder)]) == 0
     assert "Wrote" in capsys.readouterr().out and all(check.ok for check in check_files(folder)[1])
@@ -72,9 +71,7 @@ def test_bundles_without_cameras_make_no_mesh(copied: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("command", [["ns-eval"], ["ns-render", "spiral"], ["ns-export", "bitymi-atlas"]])
-def test_nerfstudios_commands_name_the_command(
-    packed: Path, copied: Path, command: list[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_name_the_command(packed: Path, copied: Path, command: list[str], monkeypatch: Patch) -> None:
     monkeypatch.setattr(sys, "argv", [*command, "--load-config", str(copied / "config.yml")])
     find_config()
     text = (copied / "config.yml").read_text()
@@ -92,8 +89,8 @@ def test_nerfstudios_commands_name_the_command(
         load_trained(packed)
 
 
-def test_nerfstudios_commands_take_a_folder_and_name_what_is_missing(
-    bundle: Path, trained: BitymiTrainerConfig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_commands_take_a_folder_and_name_what_is_missing(
+    bundle: Path, trained: Run, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     for folder in (bundle, trained.get_base_dir()):
         for given, found in (
@@ -125,9 +122,7 @@ def test_the_command_ends_in_one_line(packed: Path) -> None:
     assert lines[-1].startswith("bitymi: ") and "`bitymi unpack" in lines[-1]
 
 
-def test_what_is_no_bundle_says_what_to_give(
-    trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_bundle_is_explained(trained: Run, bundle: Path, tmp_path: Path, capsys: Printed) -> None:
     run, page = trained.get_base_dir(), tmp_path / "page"
     shutil.copytree(bundle, page / "bundle")
     checkpoint = next(trained.get_checkpoint_dir().glob("*.ckpt"))

@@ -13,7 +13,7 @@ from PIL import Image
 
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from bitymi_ns.scene.baked import as_bytes
 
 
@@ -30,9 +30,7 @@ def camera_path(bundle: Path, tmp_path: Path) -> Path:
     return tmp_path / "path.json"
 
 
-def test_a_camera_path_is_that_of_the_bundle_and_of_its_run(
-    bundle: Path, trained: BitymiTrainerConfig, camera_path: Path, tmp_path: Path
-) -> None:
+def test_bundle_and_run_share_a_camera_path(bundle: Path, trained: Run, camera_path: Path, tmp_path: Path) -> None:
     pictures = {}
     for name, folder in (("bundle", bundle), ("run", trained.get_base_dir())):
         options = {"output_path": tmp_path / name, "output_format": "images", "image_format": "png"}

@@ -15,17 +15,16 @@ from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.callbacks import FILE
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from bitymi_ns.plugin.run.trainer import BitymiTrainer
 from bitymi_ns.train.step import Training
 from tests.captures import edit
 from tests.e2e.runs import Start, a_run_of, checkpoint, different
+from tests.typed import Patch, Printed
 
 
 @pytest.mark.parametrize("by", ["load_checkpoint", "load_dir"])
-def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
-    trained: BitymiTrainerConfig, start: Start, by: str
-) -> None:
+def test_a_resumed_run_ends_like_an_uninterrupted_one(trained: Run, start: Start, by: str) -> None:
     config = start(name="resumed")
     config.max_num_iterations = None  # the interrupted run's length
     if by == "load_checkpoint":
@@ -39,9 +38,7 @@ def test_a_resumed_run_ends_bit_for_bit_like_an_uninterrupted_one(
 
 
 @pytest.mark.slow
-def test_a_finished_run_can_be_made_longer_or_an_interrupted_one_shorter(
-    trained: BitymiTrainerConfig, start: Start
-) -> None:
+def test_a_finished_run_can_be_longer_an_interrupted_one_shorter(trained: Run, start: Start) -> None:
     for number, (step, length) in enumerate([(59, 150), (40, 45)]):
         config = start(name=f"length{number}")
         config.load_dir, config.load_step, config.max_num_iterations = trained.get_checkpoint_dir(), step, length
@@ -56,7 +53,7 @@ def test_a_finished_run_can_be_made_longer_or_an_interrupted_one_shorter(
         assert checkpoint(config, length - 1)["pipeline"]["_model._extra_state"]["run"]["texels_start"] == 36
 
 
-def test_only_divergence_is_called_so(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_divergence_is_called_so(start: Start, monkeypatch: Patch) -> None:
     def wrong(self: Any, view: Any) -> None:
         raise ValueError("Trace.run: first has 951 elements, expected 1179")
 
@@ -65,14 +62,14 @@ def test_only_divergence_is_called_so(start: Start, monkeypatch: pytest.MonkeyPa
         ns_train.main(start(name="wrong"))
 
 
-def test_a_finished_run_is_not_touched_when_it_is_resumed(trained: BitymiTrainerConfig, start: Start) -> None:
+def test_a_finished_run_is_not_touched_when_it_is_resumed(trained: Run, start: Start) -> None:
     config = start(name="again")
     config.load_dir = trained.get_checkpoint_dir()
     ns_train.main(config)
     assert not config.get_checkpoint_dir().exists()
 
 
-def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int, how: signal.Signals = signal.SIGINT) -> None:
+def interrupt_at(monkeypatch: Patch, step: int, how: signal.Signals = signal.SIGINT) -> None:
     iterate = BitymiTrainer.train_iteration
 
     def train_iteration(self: BitymiTrainer, current: int) -> Any:
@@ -84,11 +81,11 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, step: int, how: signal.Signals
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_ctrl_c_saves_what_was_learned_and_says_how_to_go_on(
-    trained: BitymiTrainerConfig,
+def test_ctrl_c_saves_what_was_learned(
+    trained: Run,
     start: Start,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: Patch,
+    capsys: Printed,
     how: signal.Signals,
 ) -> None:
     config = start(name="interrupted")
@@ -109,7 +106,7 @@ def test_ctrl_c_saves_what_was_learned_and_says_how_to_go_on(
     assert different(checkpoint(trained, 59), checkpoint(resumed, 59)) == []
 
 
-def test_ctrl_c_while_the_capture_is_read(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ctrl_c_while_the_capture_is_read(start: Start, monkeypatch: Patch) -> None:
     def interrupted(*args: Any, **kwargs: Any) -> None:
         raise KeyboardInterrupt
 
@@ -120,9 +117,7 @@ def test_ctrl_c_while_the_capture_is_read(start: Start, monkeypatch: pytest.Monk
     assert stop.value.code == 130
 
 
-def test_a_run_that_branches_off_earlier_keeps_the_later_checkpoints(
-    trained: BitymiTrainerConfig, start: Start, tmp_path: Path
-) -> None:
+def test_a_branch_keeps_the_later_checkpoints(trained: Run, start: Start, tmp_path: Path) -> None:
     config = start(name="branch")
     shutil.copytree(trained.get_checkpoint_dir(), config.get_checkpoint_dir())
     config.load_dir, config.load_step, config.max_num_iterations = config.get_checkpoint_dir(), 20, 41
@@ -133,9 +128,7 @@ def test_a_run_that_branches_off_earlier_keeps_the_later_checkpoints(
     ]  # fmt: skip
 
 
-def test_going_on_with_another_capture_is_said(
-    trained: BitymiTrainerConfig, room: Path, start: Start, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_resuming_on_another_capture(trained: Run, room: Path, start: Start, tmp_path: Path, capsys: Printed) -> None:
     def resumed(change: Callable[[dict[str, Any]], None], name: str) -> str:
         data = Path(shutil.copytree(room, tmp_path / name))
         edit(data, change)
@@ -153,9 +146,7 @@ def test_going_on_with_another_capture_is_said(
     assert "its cameras stand elsewhere" in resumed(moved, "moved")
 
 
-def test_resuming_in_another_folder_cleans_up_the_one_of_the_killed_run(
-    trained: BitymiTrainerConfig, start: Start, tmp_path: Path
-) -> None:
+def test_resuming_elsewhere_cleans_up_the_killed_run(trained: Run, start: Start, tmp_path: Path) -> None:
     killed = a_run_of(trained, tmp_path)
     (killed / ".step-000000060.ckpt.unfinished").write_text("half")
     config = start(name="resumed")
@@ -164,7 +155,7 @@ def test_resuming_in_another_folder_cleans_up_the_one_of_the_killed_run(
     assert not [p.name for p in killed.iterdir() if p.name.startswith(".")]
 
 
-def test_checkpoints_that_are_missing_or_damaged(trained: BitymiTrainerConfig, start: Start, tmp_path: Path) -> None:
+def test_checkpoints_that_are_missing_or_damaged(trained: Run, start: Start, tmp_path: Path) -> None:
     config = start()
     config.load_dir = tmp_path / "nowhere"
     with pytest.raises(InputError, match="there is no checkpoint folder"):

@@ -27,13 +27,11 @@ Run = subprocess.Popen[str]
 
 
 def two(config: BitymiTrainerConfig) -> BitymiTrainerConfig:
-    """Configure the run for two processes, with checkpoints every third of its steps."""
     config.machine.num_devices, config.max_num_iterations, config.steps_per_save = 2, STEPS, STEPS // 3
     return config
 
 
 def started(config: BitymiTrainerConfig, by: tuple[str, ...] = ()) -> Run:
-    """Start a run as a program, or what another program makes of it."""
     file = config.output_dir.with_name(f"{config.timestamp}.pickle")
     file.write_bytes(pickle.dumps(config))
     command = [*by, sys.executable, "-c", TRAIN, str(file)]
@@ -44,14 +42,12 @@ def started(config: BitymiTrainerConfig, by: tuple[str, ...] = ()) -> Run:
 
 
 def wait_for(file: Path, run: Run, lines: int = 0) -> None:
-    """Wait until a run has written that many lines of a file."""
     while not file.exists() or (lines and len(file.read_text().splitlines()) < lines):
         assert run.poll() is None, run.communicate()[1]
         time.sleep(0.02)
 
 
 def process_of(run: Run, rank: int) -> psutil.Process:
-    """Find a process that torchrun has started."""
     ranks: Iterator[psutil.Process] = (
         child for child in psutil.Process(run.pid).children(recursive=True) if child.environ().get("RANK") == str(rank)
     )
@@ -83,9 +79,7 @@ def test_two_processes_leave_the_run_of_one(pair: BitymiTrainerConfig) -> None:
     assert metrics["psnr"] == pytest.approx(points[-1]["psnr"], abs=1e-3)
 
 
-def test_a_run_that_lost_a_process_goes_on_bit_for_bit_alike_until_ctrl_c(
-    pair: BitymiTrainerConfig, start: Start
-) -> None:
+def test_a_run_that_lost_a_process_goes_on_alike_until_ctrl_c(pair: BitymiTrainerConfig, start: Start) -> None:
     lost, resumed = two(start(name="lost")), two(start(name="resumed"))
     run = started(lost)
     wait_for(lost.get_checkpoint_dir() / "step-000000010.ckpt", run)

@@ -29,7 +29,6 @@ TRAINED, REFINED, BUNDLE = 19.774, 19.779, 19.050
 
 @pytest.fixture
 def stored(tmp_path: Path) -> Path:
-    """Copy capture, run and bundle, with the folder that config.yml names."""
     folder = Path(shutil.copytree(STORED, tmp_path / "stored"))
     for config in folder.rglob("config.yml"):
         config.write_text(re.sub(r"- /\n *- stored\n", f"- {folder}\n", config.read_text()))
@@ -53,9 +52,7 @@ def test_the_run_is_evaluated_resumed_and_exported(stored: Path, tmp_path: Path)
     assert not torch.equal(*(each["poses"]["motions"] for each in runs))
 
 
-def test_checkpoints_and_bundles_open_without_torch_load(
-    stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nothing_stored_needs_torch_load(stored: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("torch.load was called"))
     run = stored / "outputs" / "stored" / "bitymi" / "run"
     for folder, loaded in ((run, "nerfstudio_models/step-000000079.ckpt"), (stored / "bundle", "bundle.json")):

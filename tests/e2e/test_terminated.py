@@ -28,7 +28,7 @@ def free_port() -> int:
     ("command", "of"),
     [("viewer.run_viewer", "bundle"), ("eval", "bundle"), ("eval", "trained"), ("exporter", "trained")],
 )
-def test_a_terminated_command_ends_in_one_line_and_leaves_nothing(
+def test_terminated_commands_leave_nothing(
     command: str, of: str, trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path
 ) -> None:
     temporary, output = tmp_path / "temporary", tmp_path / "output"

@@ -13,13 +13,14 @@ from nerfstudio.utils.eval_utils import eval_setup
 
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run.callbacks import FILE
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from bitymi_ns.train import init, strategy, texels
 from tests.captures import edit, write_cloud
 from tests.e2e.runs import Start, checkpoint, config_of
+from tests.typed import Patch, Printed
 
 
-def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: BitymiTrainerConfig) -> None:
+def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: Run) -> None:
     folder = trained.get_base_dir()
     assert config_of(folder).max_num_iterations == 60
     saved = sorted(p.name for p in trained.get_checkpoint_dir().iterdir())
@@ -33,9 +34,7 @@ def test_a_run_leaves_a_configuration_checkpoints_and_a_curve(trained: BitymiTra
     assert len(counts) > 1
 
 
-def test_a_run_starts_with_as_many_surfels_as_its_steps_can_place(
-    room: Path, start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_short_runs_start_with_fewer_surfels(room: Path, start: Start, capsys: Printed, monkeypatch: Patch) -> None:
     monkeypatch.setattr(init, "FEWEST_FIRST", 10)
     config = start()
     config.max_num_iterations = 5
@@ -49,9 +48,7 @@ def test_a_run_starts_with_as_many_surfels_as_its_steps_can_place(
         assert checkpoint(*of)["pipeline"]["_model._extra_state"]["first_surfels"] == 10
 
 
-def test_a_run_that_memory_ends_says_so_in_curve_and_checkpoint(
-    start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_memory_ends_says_so(start: Start, capsys: Printed, monkeypatch: Patch) -> None:
     monkeypatch.setattr(strategy, "room_to_grow", lambda device, processes: 2e5)
     monkeypatch.setattr(texels, "room_to_grow", lambda device, processes: 0.0)
     config = start()
@@ -87,9 +84,7 @@ def test_options_out_of_range(start: Start, option: str, value: Any, message: st
 
 
 @pytest.mark.parametrize(("machine", "of_views", "of_training"), [(42, 42, 0), (7, 7, 7), (7, 5, 3)])
-def test_the_seed_of_the_machine_is_that_of_every_choice(
-    start: Start, machine: int, of_views: int, of_training: int
-) -> None:
+def test_the_machines_seed_is_every_seed(start: Start, machine: int, of_views: int, of_training: int) -> None:
     config = start()
     config.machine.seed, pipeline = machine, config.pipeline
     if machine != of_views:
@@ -119,9 +114,7 @@ def spoiled(room: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(room, tmp_path / "spoiled"))
 
 
-def test_points_that_are_nan_are_left_out_and_counted(
-    spoiled: Path, start: Start, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_nan_points_are_left_out_and_counted(spoiled: Path, start: Start, capsys: Printed) -> None:
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 3))
     points[3:8] = np.nan
     write_cloud(spoiled / "sparse_pc.ply", points)
@@ -138,9 +131,7 @@ def test_points_that_are_nan_are_left_out_and_counted(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("empty", [False, True])
-def test_a_capture_without_points_starts_at_random(
-    spoiled: Path, start: Start, capsys: pytest.CaptureFixture[str], empty: bool
-) -> None:
+def test_no_points_start_at_random(spoiled: Path, start: Start, capsys: Printed, empty: bool) -> None:
     if empty:
         write_cloud(spoiled / "sparse_pc.ply", np.empty((0, 3)))
     else:

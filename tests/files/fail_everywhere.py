@@ -60,8 +60,6 @@ Write = Callable[[int], Any]  # writes version 0 or 1; returns the exit status i
 
 
 class Faults:
-    """The preloaded library."""
-
     def __init__(self) -> None:
         self._library = ctypes.CDLL(os.environ["BITYMI_FAULTS_LIBRARY"])
         self._library.faults_arm.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_long, ctypes.c_int, ctypes.c_int]
@@ -85,7 +83,6 @@ def contents(folder: Path, folders: bool = True) -> Contents:
 
 
 def put(folder: Path, what: Contents) -> None:
-    """Make a folder have exactly these contents."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name, data in sorted(what.items()):
@@ -121,7 +118,6 @@ FOLDERS_STAY = ("maps", "begin")  # may leave empty folders
 
 
 def check(name: str, write: Write, place: Path, faults: Faults, every: bool) -> str:
-    """Try faults in one writer; returns a summary."""
     start, there = time.perf_counter(), partial(contents, place, name not in FOLDERS_STAY)
     versions: list[Contents] = []
     for version in (1, 1, 0):
@@ -163,7 +159,6 @@ def check(name: str, write: Write, place: Path, faults: Faults, every: bool) -> 
 
 
 def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
-    """Return the writers by name; each takes its folder."""
     room = generate(work / "room", views=10, width=48, height=36, seed=0, points=200)
     config = small_run(room, work / "outputs")
     config.max_num_iterations, config.steps_per_save = 10, 10

@@ -48,7 +48,6 @@ def killed_at(step: int, folder: Path, write: Callable[[], None]) -> bool:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Read all files below a folder, including hidden ones."""
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 

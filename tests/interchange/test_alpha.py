@@ -46,14 +46,12 @@ def opaque(scene: BakedScene) -> BakedScene:
 
 
 def files(scene: BakedScene) -> tuple[Gaussians, Quads]:
-    """Convert as `write_extras` without cameras."""
     nobody = torch.zeros(0, COUNT, dtype=torch.bool), torch.zeros(0, 3, dtype=torch.float64)
     colors = fit_colors(scene, weighted_residuals(scene), *nobody)
     return gaussians_of(scene, colors.harmonics), quads_of(scene, colors.color, LEVEL)
 
 
 def drawn(quads: Quads, camera: Camera) -> Tensor:
-    """Draw quads over black, a sample per pixel."""
     image, hits = torch.zeros(camera.height * camera.width, 3), nearest_hits(quads, camera, 0.2)
     image[hits.pixel] = hits.color
     return image.view(camera.height, camera.width, 3)

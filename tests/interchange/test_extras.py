@@ -21,6 +21,7 @@ from bitymi_ns.interchange.glb import upright
 from bitymi_ns.ply import parse_ply
 from tests.bundle.made import make
 from tests.interchange.glb import read_glb
+from tests.typed import Patch, Printed
 
 
 def row(camera, name: str, held_out: bool, **more) -> dict:
@@ -32,7 +33,6 @@ def row(camera, name: str, held_out: bool, **more) -> dict:
 
 
 def positions(path: Path) -> torch.Tensor:
-    """Read [N, 3] positions of a PLY file."""
     vertex = parse_ply(path.read_bytes())["vertex"]
     return torch.from_numpy(np.stack([vertex[name] for name in "xyz"], 1))
 
@@ -97,9 +97,7 @@ def test_far_away_the_files_state_their_origin(bundle: Bundle, tmp_path: Path) -
     assert float((corners - turn @ (means + to.origin)).norm()) < 20.0 < float(to.origin.norm())
 
 
-def test_a_bundle_on_its_own_is_written_by_the_command(
-    with_cameras: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_a_bundle_alone(with_cameras: Path, tmp_path: Path, capsys: Printed) -> None:
     assert cli.main(["extras", str(with_cameras)]) == 0
     out = capsys.readouterr().out
     assert "gaussians.ply: 12, " in out
@@ -115,9 +113,7 @@ def test_a_bundle_on_its_own_is_written_by_the_command(
     assert "Removed mesh.glb of the earlier " in " ".join(capsys.readouterr().out.split())
 
 
-def test_surfels_that_notes_hide_are_left_out_of_a_crop(
-    with_cameras: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_crop_hides_surfels_of_notes(with_cameras: Path, tmp_path: Path, capsys: Printed) -> None:
     args = ["extras", str(with_cameras), "--crop", "--overwrite"]
     assert cli.main(args) == 1 and "hides no surfels" in capsys.readouterr().err
     assert not (tmp_path / "scene.extras").exists()
@@ -161,9 +157,7 @@ ROW = b"""{"cameras": [{"name": "a", "held_out": true, "width": 8, "height": 6, 
         (ROW % b"[1, 1, 2e9]", "correction.2"),
     ],
 )
-def test_a_damaged_list_of_cameras_is_refused(
-    surfels, tmp_path: Path, text: bytes, message: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_damaged_cameras_are_refused(surfels, tmp_path: Path, text: bytes, message: str, monkeypatch: Patch) -> None:
     monkeypatch.setattr("bitymi_ns.bundle.write.read_bundle", Path)  # as a program that does not read what it wrote
     make(surfels, tmp_path / "b", extra_files={"cameras.json": text})
     with pytest.raises(BundleError, match=message):
@@ -190,7 +184,7 @@ def test_what_cannot_be_written_is_refused_before_the_work(bundle: Bundle, tmp_p
     assert (tmp_path / "mine" / "letter.txt").read_text() == "dear"
 
 
-def test_nothing_is_left_half_written(bundle: Bundle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_is_left_half_written(bundle: Bundle, tmp_path: Path, monkeypatch: Patch) -> None:
     write_extras(bundle, tmp_path / "out", ["gaussians"])
     before = (tmp_path / "out" / "extras.json").read_bytes()
     names = {path.name for path in tmp_path.iterdir()}

@@ -9,13 +9,11 @@ from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
 
 
 def triangles(mesh: trimesh.Trimesh, faces: np.ndarray | None = None) -> Triangles:
-    """Make a grey mesh of these faces, or of the mesh's own."""
     faces = np.array(mesh.faces if faces is None else faces, np.int64)
     return Triangles(mesh.vertices.astype(np.float32), faces, np.full(mesh.vertices.shape, 0.5, np.float32))
 
 
 def as_read(mesh: Triangles) -> trimesh.Trimesh:
-    """Read the mesh with merged vertices."""
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=True)
 
 

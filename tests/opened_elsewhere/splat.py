@@ -19,7 +19,6 @@ _AT_ONCE = 512
 
 
 def gaussians(count: int) -> Gaussians:
-    """Make random flat Gaussians."""
     g = torch.Generator().manual_seed(3)
     quats = torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1)
     scales = torch.cat([-2.0 + 0.7 * torch.randn(count, 2, generator=g), torch.full((count, 1), -16.0)], 1)

@@ -31,7 +31,6 @@ def surface() -> Triangles:
 
 
 def issues_of(file: Path) -> list[dict]:
-    """Return the validator's errors and warnings, without infos and hints."""
     found = said_by("validate_gltf.mjs", "gltf-validator", file)
     assert found["info"]["totalTriangleCount"] > 0
     return [each for each in found["issues"]["messages"] if each["severity"] < 2]
@@ -51,9 +50,7 @@ def test_gltf_of_extras_is_valid(bundle: Bundle, frame: str, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("origin", [HOME, FAR])
-def test_trimesh_finds_the_same_surface(
-    surface: Triangles, form: MeshFormat, origin: torch.Tensor, tmp_path: Path
-) -> None:
+def test_trimesh_finds_the_surface(surface: Triangles, form: MeshFormat, origin: torch.Tensor, tmp_path: Path) -> None:
     path = tmp_path / f"mesh.{form}"
     path.write_bytes(mesh_bytes(surface, form, UP, origin, NOTE if origin.any() else ""))
     scene = trimesh.load_scene(path, process=False)

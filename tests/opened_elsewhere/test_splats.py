@@ -22,7 +22,6 @@ UNKNOWN = {"UNSUPPORTED_EXTENSION", "MESH_PRIMITIVE_INVALID_ATTRIBUTE"}  # the v
 
 @pytest.fixture(params=["gaussians", "surfels"])
 def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Gaussians, Path]:
-    """Gaussians, and their file with three or two scales."""
     splats = gaussians(COUNT)
     splats.opacity_logits[:] *= 0.5  # SOG rounds opacities to bytes: logits near 0 and 1 would not come back
     write_gaussians(tmp_path / "a.ply", splats, flat=request.param == "surfels")
@@ -30,7 +29,6 @@ def written(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Gaussians, 
 
 
 def convert(source: Path, target: Path) -> Path:
-    """Let SplatTransform write a file anew; skip the test without it."""
     program = MODULES / "@playcanvas" / "splat-transform"
     if shutil.which("node") is None or not program.is_dir():
         skip_without("npm", f"no node, or {program} is missing: make web-test")
@@ -66,9 +64,7 @@ def test_gltf_keeps_every_gaussian(written: tuple[Gaussians, Path], tmp_path: Pa
 
 
 @pytest.mark.parametrize("form", ["spz", "sog"])
-def test_compressed_formats_bring_the_gaussians_back(
-    written: tuple[Gaussians, Path], form: str, tmp_path: Path
-) -> None:
+def test_compressed_formats_bring_gaussians_back(written: tuple[Gaussians, Path], form: str, tmp_path: Path) -> None:
     splats, source = written
     back = convert(convert(source, tmp_path / f"a.{form}"), tmp_path / "back.ply")
     vertex = parse_ply(back.read_bytes())["vertex"]

@@ -38,7 +38,6 @@ def other_decoder(blocks: bytes, width: int, height: int) -> np.ndarray:
 
 @pytest.mark.parametrize("mode", range(8))
 def test_another_decoder_of_bc7_agrees(mode: int) -> None:
-    """Random blocks of each mode."""
     blocks = np.random.default_rng(mode).integers(0, 256, (1000, 16), np.uint8)
     blocks[:, 0] = blocks[:, 0] >> (mode + 1) << (mode + 1) | 1 << mode
     ours = np.asarray(decode_bc7(blocks.tobytes(), 4000, 4))

@@ -19,7 +19,6 @@ KERNELS = ("gaussian_surflets", "constant_surflets")
 
 
 def complaints(path: Path) -> list[str]:
-    """What OpenUSD's validators say of a file that is no package."""
     from pxr import Usd, UsdValidation
 
     stage = Usd.Stage.Open(str(path))

@@ -21,6 +21,7 @@ from bitymi_ns.plugin.run import callbacks
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig, method_config
 from bitymi_ns.train import forecast
 from bitymi_ns.train.step import Training
+from tests.typed import Patch, Printed
 
 
 def run_on(capture: Path, output: Path) -> BitymiTrainerConfig:
@@ -31,7 +32,7 @@ def run_on(capture: Path, output: Path) -> BitymiTrainerConfig:
     return config
 
 
-def test_a_missing_capture_is_one_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_capture_is_one_message(tmp_path: Path, capsys: Printed) -> None:
     config = run_on(tmp_path / "nowhere", tmp_path / "outputs")
     with pytest.raises(InputError, match="nowhere does not exist"):
         ns_train.main(config)
@@ -40,9 +41,7 @@ def test_a_missing_capture_is_one_message(tmp_path: Path, capsys: pytest.Capture
     assert not (tmp_path / "outputs").exists()
 
 
-def test_a_run_without_a_terminal_prints_what_it_is_and_a_line_a_report(
-    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_without_a_terminal_prints_reports(capture: Path, tmp_path: Path, capsys: Printed) -> None:
     config = run_on(capture, tmp_path / "outputs")
     config.vis = "tensorboard"
     ns_train.main(config)
@@ -55,9 +54,7 @@ def test_a_run_without_a_terminal_prints_what_it_is_and_a_line_a_report(
     assert saved.pipeline.model.train.densify.interval == 500 and saved.optimizers  # it is all there
 
 
-def test_a_training_reads_its_capture_once(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_training_reads_its_capture_once(capture: Path, tmp_path: Path, monkeypatch: Patch, capsys: Printed) -> None:
     calls = {"recognise": 0, "read_transforms": 0, "as_meant": 0}
 
     def count(name: str, function: Any, *given: Any) -> Any:
@@ -73,7 +70,7 @@ def test_a_training_reads_its_capture_once(
     assert set(calls.values()) == {2}
 
 
-def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_shows_a_bar_below_the_reports(monkeypatch: Patch) -> None:
     screen = io.StringIO()
     monkeypatch.setattr(console, "CONSOLE", Console(file=screen, force_terminal=True, width=80))
     with console.step_bar(10, 40) as show_step:
@@ -88,9 +85,7 @@ def test_lengths_of_time(seconds: float, text: str) -> None:
     assert console.duration(seconds) == text
 
 
-def test_a_long_run_says_at_the_start_when_it_will_end(
-    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_long_run_says_when_it_will_end(capture: Path, tmp_path: Path, monkeypatch: Patch, capsys: Printed) -> None:
     monkeypatch.setattr(forecast, "WARM", 0)
     monkeypatch.setattr(forecast, "ENOUGH", 1)
     monkeypatch.setattr(callbacks, "SOON", 0)
@@ -103,7 +98,7 @@ def test_a_long_run_says_at_the_start_when_it_will_end(
     assert re.search(r"step +2 of 4: .* left\n", printed) and not re.search(r"step +4 of 4: .* left\n", printed)
 
 
-def test_names_do_not_control_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_do_not_control_the_terminal(capsys: Printed) -> None:
     console.say("a\x1b[2Jb [red]")
     console.warn("\x9b")
     assert (

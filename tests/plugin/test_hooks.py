@@ -41,9 +41,7 @@ def test_only_the_exporters_own_union_is_extended(monkeypatch: pytest.MonkeyPatc
     assert fake_tyro.cli is not module.tyro.cli
 
 
-def test_the_list_of_methods_to_install_reads_no_source(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_listing_methods_reads_no_source(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """It asks for the stack whenever nerfstudio is imported; naming such a method still offers its installation."""
     monkeypatch.setattr(inspect, "getmodule", lambda *args: pytest.fail("sources of all callers are searched"))
     configs = external_methods.get_external_methods()[0]
@@ -83,8 +81,6 @@ def hosts(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def view(monkeypatch: pytest.MonkeyPatch, config: Any, arguments: list[str], ours: bool = True) -> None:
-    """Run ns-viewer with these arguments on a loaded scene."""
-
     def load(*_: Any, **__: Any) -> tuple:
         if ours:
             hooks.patch_viewer(config)

@@ -129,9 +129,7 @@ CHANGES = ("read_names_of_callers", "extend_exporter", "find_config")
 
 
 @pytest.mark.parametrize("failing", CHANGES[:2])
-def test_a_change_of_nerfstudio_that_fails_takes_no_other_with_it(
-    monkeypatch: pytest.MonkeyPatch, failing: str
-) -> None:
+def test_a_failing_change_takes_no_other_with_it(monkeypatch: pytest.MonkeyPatch, failing: str) -> None:
     made = []
 
     def change(name: str) -> None:

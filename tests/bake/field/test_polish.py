@@ -54,7 +54,6 @@ def wrong(truth: Trained) -> Trained:
 
 
 def db(baked: Stage, views: list[View]) -> float:
-    """Compute the mean PSNR before quantisation."""
     errors = [(render(baked, v.camera).clamp(0, 1) - v.image).square().mean() for v in views]
     return float(torch.stack(errors).log10().mean() * -10)
 
@@ -136,9 +135,7 @@ def test_the_best_state_is_kept(truth: Trained, wrong: Trained, views: list[View
     assert all(torch.equal(kept.scene.surfels[name], value) for name, value in wrong.scene.surfels.items())
 
 
-def test_steps_that_are_not_finite_are_survived(
-    wrong: Trained, views: list[View], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_steps_not_finite_are_survived(wrong: Trained, views: list[View], monkeypatch: pytest.MonkeyPatch) -> None:
     real, calls = losses.photometric, []
 
     def sometimes(*arguments: Any) -> Tensor:
@@ -171,9 +168,7 @@ def test_masks_and_exposures(truth: Trained, wrong: Trained, views: list[View]) 
 @pytest.mark.parametrize(
     "bad", [{"steps": 0}, {"val_every": 1}, {"rate": 0.0}, {"share": 0.0}, {"pixels_per_texel": 0.0}]
 )
-def test_options_out_of_range_are_refused_and_too_few_views_change_nothing(
-    wrong: Trained, views: list[View], bad: dict[str, float]
-) -> None:
+def test_bad_options_and_too_few_views(wrong: Trained, views: list[View], bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         partial(polish_scene, wrong, views, BACKGROUND)(replace(PolishOptions(), **bad))
     same = polish_scene(wrong, views[:3], BACKGROUND)  # too few

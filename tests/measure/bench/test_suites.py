@@ -147,7 +147,7 @@ def test_ctrl_c_says_how_to_go_on(
         (("local", "--data", "/a", "--steps", "0"), "--steps must be"),
     ],
 )
-def test_mistakes_are_one_line(words: tuple[str, ...], reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_a_line(words: tuple[str, ...], reason: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(*words) == 1
     error = capsys.readouterr().err
     assert reason in error and error.startswith("bitymi: ") and error.count("\n") == 1

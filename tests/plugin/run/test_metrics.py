@@ -57,9 +57,7 @@ def test_quality_is_stated_as_it_is_and_after_a_fit_of_the_colours(monkeypatch: 
     assert result["psnr"] > 50 and result["ssim"] > 0.99 and result["mean_exposure_psnr"] < 20
 
 
-def test_the_lpips_whose_weights_are_there_is_stated(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_available_lpips_are_stated(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def one_of_two(image: torch.Tensor, reference: torch.Tensor, backbone: str) -> float:
         if backbone == "vgg":
             raise metrics.lpips.LpipsUnavailable("its weights are not there")
@@ -126,9 +124,7 @@ def test_a_full_disk_costs_a_point_and_not_the_run(tmp_path: Path, capsys: pytes
     assert "could not be written" in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_metric_that_a_view_has_none_of_is_left_out(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_metric_is_left_out(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     averages = {"psnr": math.nan, "psnr_std": math.nan, "ssim": 0.9, "ssim_std": math.nan}
     monkeypatch.setattr(VanillaPipeline, "get_average_image_metrics", lambda self, views: averages)
     pipeline = BitymiPipeline.__new__(BitymiPipeline)

@@ -19,7 +19,6 @@ def test_the_default_preset_is_the_declared_defaults_but_for_the_texture() -> No
 
 
 def repeated(values: dict, defaults: object, prefix: str = "") -> list[str]:
-    """List the keys for which a preset repeats the default."""
     found = []
     for key, value in values.items():
         default = getattr(defaults, key)

@@ -30,6 +30,7 @@ from bitymi_ns.plugin.run.films import write_image
 from bitymi_ns.plugin.run.render import spiral
 from bitymi_ns.plugin.run.surfel_model import SurfelModel, box_of
 from bitymi_ns.scene.camera import Camera
+from tests.typed import Patch, Printed
 
 DISTANCE = 3.0
 
@@ -58,8 +59,7 @@ class Wall(SurfelModel):
 
 
 @pytest.fixture
-def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
-    """The scene loaded by nerfstudio's commands."""
+def wall(monkeypatch: Patch) -> Wall:
     model = Wall()
     for name in ("install_checks", "_render_trajectory_video", "get_crop_from_json", "VanillaDataManager", "media"):
         monkeypatch.setattr(render, name, getattr(render, name))
@@ -79,8 +79,6 @@ def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
 
 
 class HeldOut:
-    """Stub of a dataset."""
-
     count = 3
 
     def __len__(self) -> int:
@@ -100,7 +98,6 @@ def cameras(count: int) -> Cameras:
 
 
 def path_of(count: int = 12, **changes: Any) -> dict[str, Any]:
-    """Make a camera path like nerfstudio's viewer."""
     pose = np.eye(4).flatten().tolist()
     frames = [{"camera_to_world": pose, "fov": 60.0, "aspect": 4 / 3} for _ in range(count)]
     found = {"camera_type": "perspective", "render_width": 32, "render_height": 24, "fps": 24, "crop": None}
@@ -172,9 +169,7 @@ def test_frames_of_a_path_keep_their_principal_points(wall: Wall, camera_path: A
     assert [camera.K[:2, 2].tolist() for camera in wall.drawn] == [[4, 9], [16, 0], [8, 6]]
 
 
-def test_odd_sizes_and_single_frames(
-    wall: Wall, camera_path: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_odd_sizes_and_one_frame(wall: Wall, camera_path: Any, tmp_path: Path, capsys: Printed) -> None:
     camera_path(path_of(1, render_width=33, render_height=25), output_path=tmp_path / "new" / "odd")
     _, frames = decoded(tmp_path / "new" / "odd.mp4")
     assert [frame.shape for frame in frames] == [(24, 32, 3)]
@@ -282,9 +277,7 @@ def test_camera_paths_that_cannot_be_used(wall: Wall, camera_path: Any, tmp_path
     assert not wall.drawn and not (tmp_path / "film.mp4").exists()
 
 
-def test_files_that_are_no_camera_path_and_one_camera(
-    wall: Wall, camera_path: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_without_camera_path(wall: Wall, camera_path: Any, tmp_path: Path, monkeypatch: Patch) -> None:
     os.mkfifo(tmp_path / "pipe.json")
     (tmp_path / "link.json").symlink_to(tmp_path / "nothing.json")
     (tmp_path / "folder.json").mkdir()
@@ -318,9 +311,7 @@ def test_numbers_in_quotes_are_numbers(wall: Wall, camera_path: Any, tmp_path: P
     assert decoded(tmp_path / "film.mp4")[0][2] == 4
 
 
-def test_frames_that_show_nothing_are_counted(
-    wall: Wall, camera_path: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_empty_frames_are_counted(wall: Wall, camera_path: Any, tmp_path: Path, capsys: Printed) -> None:
     camera_path()
     assert "nothing of the scene" not in capsys.readouterr().out
     drawn = wall.render
@@ -339,9 +330,7 @@ def test_frames_that_show_nothing_are_counted(
     assert len(list((tmp_path / "film").iterdir())) == 12
 
 
-def test_a_field_of_view_in_radians_is_a_warning(
-    wall: Wall, camera_path: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_view_of_few_degrees_is_a_warning(wall: Wall, camera_path: Any, capsys: Printed) -> None:
     found = path_of(2)
     for frame in found["camera_path"]:
         frame["fov"] = 1.2
@@ -362,22 +351,10 @@ def test_a_field_of_view_in_radians_is_a_warning(
         ("RenderInterpolated", {"render_nearest_camera": True}, "--render-nearest-camera .* need rays"),
         ("RenderInterpolated", {"output_path": Path("film.gif")}, "--output-path must end in .mp4, film.gif does not"),
         ("RenderInterpolated", {"output_path": Path()}, "--output-path '.' has no name of a film"),
-        (
-            "SpiralRender",
-            {"output_path": Path(), "output_format": "images"},
-            "--output-path '.' has no name of a folder",
-        ),
-        (
-            "RenderInterpolated",
-            {"depth_near_plane": 5.0, "depth_far_plane": 1.0},
-            "--depth-near-plane must be less than",
-        ),
+        ("SpiralRender", {"output_path": Path(), "output_format": "images"}, "'.' has no name of a folder"),
+        ("RenderInterpolated", {"depth_near_plane": 5.0, "depth_far_plane": 1.0}, "--depth-near-plane must be less"),
         ("DatasetRender", {"depth_near_plane": 5.0, "depth_far_plane": 1.0}, "--depth-near-plane must be less than"),
-        (
-            "SpiralRender",
-            {"depth_near_plane": 1e6, "rendered_output_names": ["depth"]},
-            "--depth-near-plane must be less than --depth-far-plane, and these are 1e.06",
-        ),
+        ("SpiralRender", {"depth_near_plane": 1e6, "rendered_output_names": ["depth"]}, "and these are 1e.06"),
         ("DatasetRender", {"output_path": Path(__file__)}, "test_render.py is not a folder: choose another path"),
         ("RenderInterpolated", {"output_path": Path("/proc/film.mp4")}, "/proc/film.mp4 cannot be written"),
         ("RenderInterpolated", {"rendered_output_names": ["rgba"]}, "rgba has transparency"),
@@ -392,18 +369,14 @@ def test_a_field_of_view_in_radians_is_a_warning(
         ("DatasetRender", {"rendered_output_names": ["rgba"]}, "rgba has transparency"),
     ],
 )
-def test_options_that_cannot_be_used(
-    wall: Wall, tmp_path: Path, command: str, options: dict[str, Any], message: str
-) -> None:
+def test_unusable_options(wall: Wall, tmp_path: Path, command: str, options: dict[str, Any], message: str) -> None:
     options = {"output_path": tmp_path / "film.mp4", **options}
     with pytest.raises(InputError, match=message):
         getattr(render, command)(load_config=tmp_path / "config.yml", **options).main()
     assert not list(tmp_path.iterdir())
 
 
-def test_scenes_of_other_methods_are_rendered_as_before(
-    wall: Wall, camera_path: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_other_methods_are_rendered_as_before(wall: Wall, camera_path: Any, monkeypatch: Patch) -> None:
     stock: list[Any] = []
     monkeypatch.setattr(render, "_render_trajectory_video", lambda pipeline, cameras, **_: stock.append(pipeline.model))
     checks = SimpleNamespace(check_ffmpeg_installed=lambda: stock.append("checked"))

@@ -14,11 +14,7 @@ LOST = torchrun.LOST
     ("option", "value", "message"),
     [
         ("num_devices", 0, "num-devices must be at least 1, not 0"),
-        (
-            "num_machines",
-            2,
-            "num-machines 2: .* torchrun --nnodes 2 --node-rank K .* --nproc-per-node 1 --no-python",
-        ),
+        ("num_machines", 2, "num-machines 2: .* torchrun --nnodes 2 --node-rank K .* --nproc-per-node 1"),
     ],
 )
 def test_machines_that_a_run_cannot_have(option: str, value: int, message: str) -> None:

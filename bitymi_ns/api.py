@@ -171,12 +171,12 @@ def _check_ranges(**ranges: tuple[Tensor, float, float]) -> None:
     raise ValueError(f"{name} have to be {limits}: {name}{list(row)} is {values[row].item():g}")
 
 
-def _logit(share: Tensor) -> Tensor:
+def _logit(p: Tensor) -> Tensor:
     """Compute logits, clamped to finite values with a straight-through gradient. The operations take logits, like those
     of training, and apply the sigmoid: its slope o (1 - o) is exact as a function of the logit, but in float32 nothing
     is left of 1 - o where o -> 1."""
-    nearest = share.clamp(1e-12, 1.0 - 8 * torch.finfo(share.dtype).eps)
-    return torch.logit(share + (nearest - share).detach())
+    nearest = p.clamp(1e-12, 1.0 - 8 * torch.finfo(p.dtype).eps)
+    return torch.logit(p + (nearest - p).detach())
 
 
 @learning_modes()

@@ -261,7 +261,7 @@ class Extras:
 
 
 @dataclass
-class ViewBundle:
+class View:
     """Show a bundle in the browser, or export it with its page to a folder for any web server."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
@@ -318,19 +318,8 @@ class Doctor:
         return 0 if line else 1
 
 
-Command = (
-    Annotated[Sample, tyro.conf.subcommand(name="sample")]
-    | Annotated[Sfm, tyro.conf.subcommand(name="sfm")]
-    | Annotated[Report, tyro.conf.subcommand(name="report")]
-    | Annotated[Stability, tyro.conf.subcommand(name="stability")]
-    | Annotated[Bench, tyro.conf.subcommand(name="bench")]
-    | Annotated[Verify, tyro.conf.subcommand(name="verify")]
-    | Annotated[Pack, tyro.conf.subcommand(name="pack")]
-    | Annotated[Unpack, tyro.conf.subcommand(name="unpack")]
-    | Annotated[Extras, tyro.conf.subcommand(name="extras")]
-    | Annotated[Doctor, tyro.conf.subcommand(name="doctor")]
-    | Annotated[ViewBundle, tyro.conf.subcommand(name="view")]
-)
+Command = Sample | Sfm | Report | Stability | Bench | Verify | Pack | Unpack | Extras | Doctor | View
+"""Subcommands, by the names of their classes."""
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -75,13 +75,12 @@ def _concerns(name: object, path: Path) -> bool:
     return beside == place.name or beside.startswith(f".{place.name}.")
 
 
+size_text = decimal  # a number of bytes in decimal units
+
+
 def free_bytes(path: Path) -> int:
     """Return the free space for a file or folder, which need not exist, nor its parents."""
     return shutil.disk_usage(_nearest(path.absolute())).free
-
-
-def size_text(size: int) -> str:
-    return decimal(size)
 
 
 def _nearest(path: Path) -> Path:

@@ -52,7 +52,12 @@ def no_links(name: str | os.PathLike[str], flags: int) -> int:
                 raise Refused(f"{path} is a link, which is not followed: remove it", path) from error
             raise
     try:
-        _check(path, os.fstat(file))
+        found = os.fstat(file)
+        if not stat.S_ISREG(found.st_mode):
+            raise Refused(f"{path} exists and is not a regular file: remove it", path)
+        if found.st_nlink > 1:
+            raise Refused(f"{path} is also the file of another name (a hard link): remove it", path)
+        _check_owner(path, found)
         os.set_blocking(file, True)
         if empty:
             os.ftruncate(file, 0)
@@ -60,14 +65,6 @@ def no_links(name: str | os.PathLike[str], flags: int) -> int:
         os.close(file)
         raise
     return file
-
-
-def _check(path: Path, found: os.stat_result) -> None:
-    if not stat.S_ISREG(found.st_mode):
-        raise Refused(f"{path} exists and is not a regular file: remove it", path)
-    if found.st_nlink > 1:
-        raise Refused(f"{path} is also the file of another name (a hard link): remove it", path)
-    _check_owner(path, found)
 
 
 def _check_owner(path: Path, found: os.stat_result) -> None:

@@ -138,7 +138,7 @@ class Coder:
             coder = TexelCoder(self._sizes[order], coverage[:, 1], step)
             alphas = None if baked.alpha is None else coder.code_alpha(baked.alpha.values[moved])
             coded, listed = coder.code(texels), joined(texels, alphas)
-            decoded, means = joined(coded.texels_of(coder.blocks), alphas), coded.means
+            decoded, means = joined(coded.texels(coder.blocks), alphas), coded.means
         scene = replace(baked.scene, surfels=codes.surfels())
         rounded = baked.become(
             Rounded,

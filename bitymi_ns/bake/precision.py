@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.codec.surfel_codes import CODED, REFERENCE, SurfelCodes, code_surfels, reordered, term_numbers
+from bitymi_ns.codec.surfel_codes import CODED, REFERENCE, code_surfels, reordered, term_numbers
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.train.losses import psnr
@@ -93,22 +93,17 @@ def column_noise(
         counts[name] = len(column) * (3 if name == "place" else column.shape[1])
         if name == "extent":
             changed = replace(plain, extent=extent)
+        elif name in ("term_shape", "term_color"):
+            at, terms = term_numbers(codes.kind)[name == "term_shape"], plain.surfels["view_terms"].clone()
+            terms[:, at] = rounded["view_terms"][:, at]
+            changed = replace(plain, surfels={**plain.surfels, "view_terms": terms})
         else:
-            changed = replace(plain, surfels={**plain.surfels, **_column(plain, codes, rounded, name)})
+            parameter = CODED.get(name, name)
+            changed = replace(plain, surfels={**plain.surfels, parameter: rounded[parameter]})
         error = pictures.square(pictures.of(changed), drawn) if len(column) and pictures.views else 0.0
         noise[name] = error / codes.steps[name] ** 2
         progress("rounding the surfels", done + 1, len(REFERENCE))
     return ColumnNoise(noise, counts)
-
-
-def _column(scene: BakedScene, codes: SurfelCodes, rounded: Mapping[str, Tensor], column: str) -> dict[str, Tensor]:
-    """Replace a column's numbers in its parameter by the rounded ones."""
-    if column not in ("term_shape", "term_color"):
-        name = CODED.get(column, column)
-        return {name: rounded[name]}
-    at, terms = term_numbers(codes.kind)[column == "term_shape"], scene.surfels["view_terms"].clone()
-    terms[:, at] = rounded["view_terms"][:, at]
-    return {"view_terms": terms}
 
 
 def _step(name: str, error: float, noise: float) -> float:

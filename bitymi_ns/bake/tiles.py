@@ -123,7 +123,9 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     sizes = torch.zeros(len(tiles.sizes), 2, dtype=torch.int32)
     for size, rows, index in listed_tiles(tiles.sizes.to(device), options.chunk):
         values, weight = fine[index].permute(0, 3, 1, 2).contiguous(), weights(shown, rows, size)
-        mean, flat = _constant(values, weight, options.tolerance)
+        square = weight.square()[:, None]
+        mean = (values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)  # the nearest constant
+        flat = weighted_rms(values - mean[:, :, None, None], weight) <= options.tolerance
         constant[rows.cpu()] = mean.cpu()
         textured = torch.nonzero(~flat).squeeze(1)
         for smaller, at in _grids(values[textured], weight[textured], options.tolerance, options.r_min):
@@ -139,13 +141,6 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
         own = texels.permute(0, 2, 3, 1).flatten(1, 2)
         listed[first[rows, None] + torch.arange(own.shape[1])] = own
     return Tiles(sizes, tiles.extent, listed)
-
-
-def _constant(values: Tensor, weight: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-    """Find the nearest constant [n, C] to tiles [n, C, v, u], and whether it is within the tolerance, [n] bool."""
-    square = weight.square()[:, None]
-    constant = (values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)
-    return constant, weighted_rms(values - constant[:, :, None, None], weight) <= tolerance
 
 
 def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
@@ -164,7 +159,7 @@ def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list
     for side in sides_v[:-1]:
         lost = torch.eye(limit_v) - interpolation(limit_v, side) @ fit(limit_v, side)
         along_v[side] = weighted_rms((flipped @ lost.T.to(values)).transpose(2, 3), weight).square()
-    found = []
+    chosen = []
     open_ = torch.ones(count, dtype=torch.bool, device=values.device)
     for size in sorted(((u, v) for u in sides_u for v in sides_v), key=lambda s: (s[0] * s[1], abs(s[0] - s[1]))):
         promising = open_ & (along_u[size[0]] + along_v[size[1]] <= (_FORESIGHT * tolerance) ** 2)
@@ -175,5 +170,5 @@ def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list
             at = at[weighted_rms(rebuilt - values[at], weight[at]) <= tolerance]
         if len(at):
             open_[at] = False
-            found.append((size, at))
-    return found
+            chosen.append((size, at))
+    return chosen

@@ -62,7 +62,7 @@ class Cosines:
         return self._coded(best.listed, self._coder.fit(best.texels, self._most, rounds=1))
 
     def _coded(self, texels: Tensor, codes: TexelCodes) -> StoredTexels:
-        return StoredTexels(texels.clone(), codes.texels_of(self._coder.blocks), codes)
+        return StoredTexels(texels.clone(), codes.texels(self._coder.blocks), codes)
 
 
 class Pages:

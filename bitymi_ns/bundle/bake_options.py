@@ -1,13 +1,16 @@
 """Options of the bake, recorded in bundle.json."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
+
+from pydantic import Field
 
 from bitymi_ns.codec.bc7_encode import Profile, bc7_encoder
 from bitymi_ns.codec.limits import EXTENTS
 from bitymi_ns.codec.packing import check_page
 from bitymi_ns.codec.quantise import STEPS, Format, RangeRule
 from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.ranges import Count, PositiveCount, check_ranges
 from bitymi_ns.scene.tile_sizes import check_sides
 
 BundleFormat = Literal["compact", Format]
@@ -27,10 +30,10 @@ class BakeOptions:
     """Smallest tile side in texels, a power of two of at least 4."""
     r_max: int = 64
     """Largest tile side in texels, a power of two."""
-    extent: float = SUPPORT
+    extent: Annotated[float, Field(ge=EXTENTS[0], le=EXTENTS[1])] = SUPPORT
     """Largest half side of a tile in scale units (the paper's e, 4 there); 3 covers exactly the kernel's support. With
     a tolerance a tile covers only fragments above the weight bound."""
-    tolerance: float = 0.75
+    tolerance: Annotated[float, Field(ge=0, lt=STEPS)] = 0.75
     """Largest error of the reduction, in 8-bit steps, weighted by a fragment's largest contribution to a pixel. A tile
     takes the smallest grid, or none, whose root mean square error over its visible part is within it. A view colour
     keeps the fewest Spherical Voronoi sites, or one colour, whose largest error is within it, over the directions of
@@ -45,15 +48,15 @@ class BakeOptions:
     """Drop surfels that no training view blends (if views are given)."""
     range: RangeRule = "sigma6"
     """Quantisation range: sigma6 = mean +- 6 standard deviations, minmax = no clipping, auto = the smaller error."""
-    range_samples: int = 1 << 18
+    range_samples: PositiveCount = 1 << 18
     """Texels in the bootstrap sample for the range."""
-    seed: int = 0
+    seed: Count = 0
     """Seed of that sample."""
     page_width: int = 4096
     """Width of an atlas page in texels, a power of two; small atlases get narrower pages."""
     page_rows: int = 8192
     """Largest height of an atlas page; phones and WebGPU stop at 8192."""
-    chunk: int = 1 << 18
+    chunk: PositiveCount = 1 << 18
     """Texels evaluated at once."""
 
     @property
@@ -68,24 +71,16 @@ class BakeOptions:
 
     def check(self) -> None:
         """Raise ValueError: an option is out of its range; RuntimeError: the BC7 encoder is not installed."""
-        if not EXTENTS[0] <= self.extent <= EXTENTS[1]:
-            raise ValueError(f"the extent must be from {EXTENTS[0]:g} to {EXTENTS[1]:g}, not {self.extent}")
-        if not 0 <= self.tolerance < STEPS:
-            raise ValueError(f"the tolerance must be from 0 to below {STEPS:g} steps, not {self.tolerance}")
-        for name in ("range_samples", "chunk"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1, not {getattr(self, name)}")
-        if self.seed < 0:
-            raise ValueError(f"the seed must not be negative, it is {self.seed}")
+        formats = get_args(BundleFormat)
+        if self.bundle_format not in formats:
+            raise ValueError(f"there is no format {self.format!r}: choose among {', '.join(formats)}")
+        check_ranges(self)
         check_sides(self.r_min, self.r_max)
         check_page(self.page_width, self.page_rows)
         if self.r_max > self.page_width or self.page_rows % self.r_max:
             raise ValueError(
                 f"tiles of r_max = {self.r_max} texels do not fit pages of {self.page_width} x {self.page_rows} texels"
             )
-        formats = get_args(BundleFormat)
-        if self.bundle_format not in formats:
-            raise ValueError(f"there is no format {self.format!r}: choose among {', '.join(formats)}")
         if self.format == "compact" and self.tolerance == 0:
             raise ValueError("a compact bundle needs a tolerance above 0: choose another format, or another tolerance")
         if self.texel_format == "bc7":

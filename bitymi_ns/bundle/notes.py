@@ -44,12 +44,6 @@ def _unit_length(vector: list[float]) -> list[float]:
     return vector
 
 
-def _some(lengths: list[float]) -> list[float]:
-    if min(lengths) <= 0:
-        raise ValueError("must be positive")
-    return lengths
-
-
 _Number = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
 _Vector = Annotated[list[_Number], Field(min_length=3, max_length=3)]
 _Lens = Annotated[list[_Number], Field(min_length=6, max_length=6), AfterValidator(_positive)]
@@ -100,7 +94,7 @@ class OrientedBox(_Strict):
     """Box in the scene frame: its axes are those of the rotation `quat` (wxyz)."""
 
     center: _Vector
-    half: Annotated[_Vector, AfterValidator(_some)]
+    half: Annotated[list[Annotated[float, Field(gt=0, le=FARTHEST)]], Field(min_length=3, max_length=3)]
     quat: Annotated[list[_Number], Field(min_length=4, max_length=4), AfterValidator(_unit_length)]
 
 

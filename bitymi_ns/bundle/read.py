@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from io import BufferedReader
 from pathlib import Path
@@ -168,28 +168,27 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
             raise BundleError(f"{path}: {error}") from error
         if keep and name in SCENE_FILES:
             check_memory(parts.bundle, info, name)
-        sha256 = hashlib.sha256() if verify else None
-        data = _read_whole(file, head, size, keep, path, sha256)
-    if sha256 is not None and sha256.hexdigest() != entry.sha256:
+        sha256 = hashlib.sha256()
+        data = _read_whole(file, head, size, keep, path, sha256.update if verify else len)
+    if verify and sha256.hexdigest() != entry.sha256:
         raise BundleError(f"{path} is altered: its sha256 is not the one in {MANIFEST}")
     return data
 
 
-def _read_whole(file: BufferedReader, head: bytes, size: int, keep: bool, path: Path, sha256: Any) -> bytearray:
-    """Read a file of `size` bytes, of which `head` is read already, and feed them to `sha256`; return them if
-    `keep`."""
+def _read_whole(
+    file: BufferedReader, head: bytes, size: int, keep: bool, path: Path, take: Callable[[Any], object]
+) -> bytearray:
+    """Read a file of `size` bytes, of which `head` is read already; `take` gets all of them. Return them if `keep`."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
     view = memoryview(data)
     view[:at] = head
-    if sha256 is not None:
-        sha256.update(head)
+    take(head)
     while at < size:
         window = view[at : at + _CHUNK] if keep else view[: min(_CHUNK, size - at)]
         count = file.readinto(window)
         if not count:
             raise BundleError(f"{path} is truncated: it ended after {at} bytes while it was read")
-        if sha256 is not None:
-            sha256.update(window[:count])
+        take(window[:count])
         at += count
     return data if keep else bytearray()
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bundle import compact
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError
+from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
 from bitymi_ns.bundle.notes import read_notes
 from bitymi_ns.bundle.parts import NOTES, Parts, parts_of
 from bitymi_ns.bundle.read import CONTENTS, Bundle, assemble, manifest_of, read_file
@@ -30,17 +30,23 @@ def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
     unreadable."""
     try:
         with parts_of(folder) as parts:
-            return _check_parts(parts)
-    except BundleError as error:  # a single file that cannot be opened
-        return None, [Check(MANIFEST, False, str(error))]
-
-
-def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
-    try:
-        info = manifest_of(parts)
+            info = manifest_of(parts)
+            checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{_format_world(info.world)}")]
+            bundle = _check_contents(parts, info, checks)
+            if bundle is not None:
+                checks += [_tiles(bundle), _check_counts(bundle), *check_certificate(bundle)]
+                try:
+                    notes = read_notes(parts)
+                    checks += [] if notes is None else [Check(NOTES, True, notes[1].contents)]
+                except BundleError as error:
+                    checks.append(Check(NOTES, False, str(error)))
+            return bundle, checks
     except BundleError as error:
         return None, [Check(MANIFEST, False, str(error))]
-    checks = [Check(MANIFEST, True, f"version {info.version}, by {info.generator}{_format_world(info.world)}")]
+
+
+def _check_contents(parts: Parts, info: Manifest, checks: list[Check]) -> Bundle | None:
+    """Add the checks of the files that bundle.json lists, and return what they hold; None if it cannot be read."""
     files: dict[str, bytearray] = {}
     try:
         with enough_memory(parts.bundle, info):
@@ -51,21 +57,16 @@ def _check_parts(parts: Parts) -> tuple[Bundle | None, list[Check]]:
                 except BundleError as error:
                     checks.append(Check(name, False, str(error)))
             if not all(check.ok for check in checks):
-                return None, checks
+                return None
             bundle = assemble(parts.bundle, info, files)
     except BundleError as error:
-        return None, [*checks, Check("contents", False, str(error))]
+        checks.append(Check("contents", False, str(error)))
+        return None
     checks.append(Check("contents", True, f"{len(bundle):,} surfels, all numbers finite, tiles inside the atlas"))
     if info.decoded is not None:  # the integers of a compact bundle, as decoded here
         same = compact.decoded_hash(info, files) == info.decoded
         checks.append(Check("decoder", same, f"the integers are {'those' if same else 'not those'} that were written"))
-    checks += [_tiles(bundle), _check_counts(bundle), *check_certificate(bundle)]
-    try:
-        notes = read_notes(parts)
-        checks += [] if notes is None else [Check(NOTES, True, notes[1].contents)]
-    except BundleError as error:
-        checks.append(Check(NOTES, False, str(error)))
-    return bundle, checks
+    return bundle
 
 
 def _format_world(frame: WorldEntry) -> str:
@@ -129,22 +130,22 @@ def _count_tiles(tiles: Tensor, atlas: Tensor | None) -> Tensor:
 
 
 def _check_counts(bundle: Bundle) -> Check:
-    statistics = bundle.info.statistics
+    statistics, scene = bundle.info.statistics, bundle.scene
     surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color
-    found = {"surfels kept": len(bundle), "texels kept": int(bundle.scene.tiles[:, 3:].long().prod(1).sum())}
-    found["surfels without_tile"] = int((bundle.scene.tiles[:, 3] == 0).sum())
-    stated = {
-        "surfels kept": surfels and surfels.kept,
-        "texels kept": texels and texels.kept,
-        "surfels without_tile": surfels and surfels.without_tile,
-    }
-    if lean is not None and "view_terms" in bundle.scene.surfels:
-        stated |= {"view colour sites": lean.sites.after, "surfels of one colour": lean.one_color}
-        found["view colour sites"] = len(bundle) + len(bundle.scene.surfels["view_terms"])
-        found["surfels of one colour"] = int((bundle.scene.surfels["view_span"][:, 1] == 0).sum())
-    for name, value in stated.items():
-        if value is not None and value != found[name]:
-            return Check("statistics", False, f"{name}: {value:,} stated, {found[name]:,} found")
+    counts = [
+        ("surfels kept", surfels and surfels.kept, len(bundle)),
+        ("texels kept", texels and texels.kept, int(scene.tiles[:, 3:].long().prod(1).sum())),
+        ("surfels without_tile", surfels and surfels.without_tile, int((scene.tiles[:, 3] == 0).sum())),
+    ]
+    if lean is not None and "view_terms" in scene.surfels:
+        one_color = int((scene.surfels["view_span"][:, 1] == 0).sum())
+        counts += [
+            ("view colour sites", lean.sites.after, len(bundle) + len(scene.surfels["view_terms"])),
+            ("surfels of one colour", lean.one_color, one_color),
+        ]
+    for name, stated, there in counts:
+        if stated is not None and stated != there:
+            return Check("statistics", False, f"{name}: {stated:,} stated, {there:,} found")
     detail = "agree with the files"
     if lean is not None:
         detail += f"; error of a view colour at most {steps_text(lean.error.p100)} steps, tolerance {lean.tolerance:g}"

@@ -250,9 +250,9 @@ def _sigmoid(x: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     return 1.0 / (1.0 + np.exp(-np.clip(x, -500.0, 500.0)))
 
 
-def _logit(share: npt.NDArray[np.float64], least: float) -> npt.NDArray[np.float64]:
-    share = np.clip(share, least, 1.0 - SMALLEST_SHARE)
-    return np.log(share) - np.log1p(-share)
+def _logit(p: npt.NDArray[np.float64], least: float) -> npt.NDArray[np.float64]:
+    p = np.clip(p, least, 1.0 - SMALLEST_SHARE)
+    return np.log(p) - np.log1p(-p)
 
 
 def _clip_to_limits(name: str, kind: str, values: npt.NDArray[np.float64]) -> Tensor:

@@ -135,12 +135,9 @@ class TexelCodes:
         """[N, 3] mean residuals."""
         return constants(self.residual, self.residual_step)
 
-    def texels(self) -> Tensor:
-        """Decode the residual colours [T, 3], in the order of `TexelTiles`."""
-        return self.texels_of(blocks_of(self.sizes))
-
-    def texels_of(self, blocks: Sequence[Blocks]) -> Tensor:
-        """Decode as `texels`, given the tiles' blocks."""
+    def texels(self, blocks: Sequence[Blocks] | None = None) -> Tensor:
+        """Decode the residual colours [T, 3], in the order of `TexelTiles`. `blocks`: of the sizes, if at hand."""
+        blocks = blocks_of(self.sizes) if blocks is None else blocks
         return _decode(self.constants, self.coefficients, blocks, self.sizes, _steps(self.step, self.grades))
 
     def decoded(self) -> Tensor:

@@ -122,11 +122,11 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
             m[tiled] = fetch_texels(scene, scene.tiles[own].long(), of_tile, of_tile)[..., 3].flatten(1).double()
         kernel = opacity[rows, None].double() * torch.where(rest > 0, rest ** beta[rows, None].double(), 0.0)
         cut = (kernel * m).clamp(max=ALPHA_MAX)
-        share, uncut = (f / f.sum(1, keepdim=True).clamp(min=1e-12) for f in (cut, kernel))
-        strength[rows] = (share * cut).sum(1) / (uncut * kernel).sum(1).clamp(min=1e-12)
-        center[rows] = share @ at
+        mass, uncut = (f / f.sum(1, keepdim=True).clamp(min=1e-12) for f in (cut, kernel))
+        strength[rows] = (mass * cut).sum(1) / (uncut * kernel).sum(1).clamp(min=1e-12)
+        center[rows] = mass @ at
         least = step**2 / 12.0 * torch.eye(2, dtype=torch.float64)  # covariance within a grid cell
-        second = torch.einsum("np,pi,pj->nij", share, at, at) - center[rows, :, None] * center[rows, None] + least
+        second = torch.einsum("np,pi,pj->nij", mass, at, at) - center[rows, :, None] * center[rows, None] + least
         whole = uncut @ at[:, 0].square() + step**2 / 12.0
         covariance[rows] = second / whole[:, None, None]
     return strength, center, covariance

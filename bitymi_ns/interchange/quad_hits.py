@@ -71,9 +71,9 @@ def _boxes(corners: Tensor, K: Tensor, near: float, width: int, height: int) -> 
     and quad indices [M]."""
     rows = torch.nonzero((corners[..., 2] > near).any(1)).squeeze(1)
     start, end = corners[rows], corners[rows].roll(-1, 1)
-    share = (near - start[..., 2:]) / (end[..., 2:] - start[..., 2:])  # position along a side at the near plane
-    meets = (share > 0) & (share < 1)
-    points = torch.cat([start, start + torch.where(meets, share, 0.0) * (end - start)], dim=1)
+    along = (near - start[..., 2:]) / (end[..., 2:] - start[..., 2:])  # position along a side at the near plane
+    meets = (along > 0) & (along < 1)
+    points = torch.cat([start, start + torch.where(meets, along, 0.0) * (end - start)], dim=1)
     there = torch.cat([start[..., 2:] > near, meets], dim=1)
     at = (points @ K.T)[..., :2] / points[..., 2:].clamp(min=near)
     most = torch.tensor([width, height])
@@ -97,6 +97,6 @@ def _fetch(pages: Tensor, page: Tensor, uv: Tensor) -> Tensor:
     size = torch.tensor([pages.shape[2], pages.shape[1]])
     at = uv * size - 0.5
     low = at.floor()
-    share = (at - low).float()
+    weights = (at - low).float()
     low, high = (torch.minimum(c.clamp(min=0), size - 1) for c in (low.long(), low.long() + 1))
-    return bilinear(lambda x, y: pages[page, y, x].float() / 255.0, low.unbind(1), high.unbind(1), share.split(1, 1))
+    return bilinear(lambda x, y: pages[page, y, x].float() / 255.0, low.unbind(1), high.unbind(1), weights.split(1, 1))

@@ -51,10 +51,11 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
     surfels = scene.surfels
     opacity = torch.sigmoid(surfels["opacity_logits"].double()) * _largest_alpha(scene)
     kept = torch.nonzero(opacity > level).squeeze(1)
-    share = (level / opacity[kept]) ** (1.0 / kernel_parameters(surfels)[1][kept].double().clamp(min=1e-6))
-    radius = (SUPPORT * (1.0 - share).clamp(min=1e-12).sqrt()).float()
+    falloff = (level / opacity[kept]) ** (1.0 / kernel_parameters(surfels)[1][kept].double().clamp(min=1e-6))
+    radius = (SUPPORT * (1.0 - falloff).clamp(min=1e-12).sqrt()).float()
     extent = torch.full_like(radius, SUPPORT) if scene.extent is None else scene.extent[kept]
-    size = _sizes(scene.tiles[kept, 3:], radius / extent)
+    covered = scene.tiles[kept, 3:] * (radius / extent)[:, None]  # texels; the tile's resolution is kept
+    size = next_power_of_two(covered.ceil()).clamp(min=GRID).long()
     packing = pack(size.numpy())
     tiles = torch.from_numpy(packing.tiles)
     pages = torch.zeros(packing.layers * packing.height * packing.width, 4, dtype=torch.uint8)
@@ -92,10 +93,10 @@ def fetch_texels(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tens
 
 
 def bilinear(
-    fetch: Callable[[Tensor, Tensor], Tensor], low: Sequence[Tensor], high: Sequence[Tensor], share: Sequence[Tensor]
+    fetch: Callable[[Tensor, Tensor], Tensor], low: Sequence[Tensor], high: Sequence[Tensor], weights: Sequence[Tensor]
 ) -> Tensor:
-    """Interpolate what `fetch` returns for x, y between `low` and `high`, by the shares of the high ones."""
-    (x, y), (next_x, next_y), (fu, fv) = low, high, share
+    """Interpolate what `fetch` returns for x, y between `low` and `high`, by the weights of the high ones."""
+    (x, y), (next_x, next_y), (fu, fv) = low, high, weights
     top = fetch(x, y) * (1 - fu) + fetch(next_x, y) * fu
     bottom = fetch(x, next_y) * (1 - fu) + fetch(next_x, next_y) * fu
     return top * (1 - fv) + bottom * fv
@@ -108,12 +109,6 @@ def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, 
     x = torch.minimum(x, last.to(x))
     low = x.floor().long()
     return low + first[:, None], torch.minimum(low + 1, last) + first[:, None], x - low
-
-
-def _sizes(tiles: Tensor, share: Tensor) -> Tensor:
-    """Choose texture sides [n, 2] of quads that cover a share [n] of tiles [n, 2]: the tile's resolution, rounded up to
-    powers of two."""
-    return next_power_of_two((tiles * share[:, None]).ceil()).clamp(min=GRID).long()
 
 
 def _texels(

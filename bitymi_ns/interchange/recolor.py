@@ -44,22 +44,14 @@ def recolored(
         texels.index_add_(0, at, wanted[hits.pixel])
         count.index_add_(0, at, one)
         progress("colouring the mesh", done, len(cameras))
-    owner = _owners(quads)
+    corners = quads.uv.double() * torch.tensor([width, height])  # centres of texels
+    size = (corners[:, 2] - corners[:, 0]).round().long() + 1
+    tiles = torch.cat([corners[:, 0].floor().long(), quads.page[:, None], size], dim=1)
+    owner = torch.full((pages * height * width,), -1)  # the quad of each texel; -1: none
+    for r_u, r_v, rows in size_classes(size):
+        owner[texel_index(tiles[rows], (r_u, r_v), width, height)] = rows[:, None, None].expand(-1, r_v, r_u)
     owned = torch.nonzero(owner >= 0).squeeze(1)
     before = flat[owned, :3].float() / 255.0 + (shift / (shown + PRIOR))[owner[owned]]
     after = (PRIOR * before + texels[owned]) / (PRIOR + count[owned])
     flat[owned, :3] = (after.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
     return replace(quads, pages=flat.view_as(quads.pages))
-
-
-def _owners(quads: Quads) -> Tensor:
-    """Find the quad of each texel of the pages: row indices, flat; -1: none."""
-    pages, height, width, _ = quads.pages.shape
-    corners = quads.uv.double() * torch.tensor([width, height])  # centres of texels
-    first = corners[:, 0].floor().long()
-    size = (corners[:, 2] - corners[:, 0]).round().long() + 1
-    tiles = torch.cat([first, quads.page[:, None], size], dim=1)
-    owner = torch.full((pages * height * width,), -1)
-    for r_u, r_v, rows in size_classes(tiles[:, 3:]):
-        owner[texel_index(tiles[rows], (r_u, r_v), width, height)] = rows[:, None, None].expand(-1, r_v, r_u)
-    return owner

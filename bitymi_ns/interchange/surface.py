@@ -139,7 +139,8 @@ def extract_surface(
         for i, camera in enumerate(cameras):
             inside = _cut(depths[i], small[i], box)
             far = inside[inside > 0].quantile(FAR).item() if inside.any() else 0.0
-            camera = _coarsened(camera, PIXELS_PER_VOXEL * far / voxel)
+            side = max(camera.width, camera.height) * (PIXELS_PER_VOXEL * far / voxel)
+            camera = camera.within(max(BOX_SIDE, math.ceil(side / float(camera.K[:2, :2].diagonal().max()))))
             depth = _cut(median_depth(surfels, camera, near, alpha).cpu(), camera, box)
             if bool((depth[::SAMPLED, ::SAMPLED] > 0).any()):
                 _integrate(volume, camera, depth, render(camera))
@@ -148,12 +149,6 @@ def extract_surface(
         if not len(mesh.triangles):
             raise NoSurface("the depth maps fuse to no surface: try a smaller --resolution")
         return _postprocess(mesh, options, progress, to)
-
-
-def _coarsened(camera: Camera, focal: float) -> Camera:
-    """Scale a camera's image down to a focal length in pixels, but not below `BOX_SIDE`."""
-    side = max(camera.width, camera.height)
-    return camera.within(max(BOX_SIDE, math.ceil(side * focal / float(camera.K[:2, :2].diagonal().max()))))
 
 
 def _cut(depth: Tensor, camera: Camera, box: Tensor) -> Tensor:

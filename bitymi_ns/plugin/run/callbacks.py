@@ -5,7 +5,6 @@ import json
 import math
 import os
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NoReturn
@@ -31,7 +30,7 @@ from bitymi_ns.scene.visibility import views_without_surfels
 from bitymi_ns.train import messages
 from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.evaluate import evaluate
-from bitymi_ns.train.forecast import Forecast, Steps, expected_surfels
+from bitymi_ns.train.forecast import Forecast, expected_surfels
 from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, covered_fraction
@@ -98,15 +97,12 @@ class TrainingRun:
         lists = schedule.lists_fragments(facts.has_maps)
         most = max(len(scene), int(surfels[self.first_step :].max(initial=0)))
         state_training(scene, cameras, most, texels, to_come, trainer.world_size, lists)
-        self.forecast = self._forecast(pixels, surfels)
-        self._longest_side = max(max(camera.width, camera.height) for camera in cameras)
-
-    def _forecast(self, pixels: Sequence[int], surfels: Steps) -> Forecast:
         held_out = len(self.datamanager.eval_dataset)
         at_once = min(held_out, self._curve_views or held_out)
         evaluated = {step: held_out if step + 1 >= self.total else at_once for step in self.curve_steps}
-        on_gpu, mean = self.scene.surfels["means"].is_cuda, sum(pixels) / len(pixels)
-        return Forecast(self.training.schedule, len(pixels), mean, surfels, evaluated, self.first_step, on_gpu)
+        on_gpu = scene.surfels["means"].is_cuda
+        self.forecast = Forecast(schedule, len(pixels), mean, surfels, evaluated, self.first_step, on_gpu)
+        self._longest_side = max(max(camera.width, camera.height) for camera in cameras)
 
     def _compare_sizes(self, step: int) -> None:
         """Measure for the forecast what a step takes at the sizes of pictures that are to come."""

@@ -96,7 +96,11 @@ class BitymiTrainerConfig(TrainerConfig):
         self._check_options()
         if not several and (self.machine.num_machines, self.machine.num_devices) != (1, 1):
             torchrun.run(self)
-        self._seed_by_machine()
+        if self.machine.seed != MachineConfig().seed:  # for the other seeds that are not given
+            pipeline = self.pipeline
+            for owner, name in ((pipeline.datamanager, "train_cameras_sampling_seed"), (pipeline.model.train, "seed")):
+                if getattr(owner, name) == type(owner).__dataclass_fields__[name].default:
+                    setattr(owner, name, self.machine.seed)
         if self.machine.device_type != "cpu" and (why := why_not_cuda()):
             warn(f"Training on the CPU instead of {self.machine.device_type}: {why}.")
             self.machine.device_type = "cpu"
@@ -104,14 +108,6 @@ class BitymiTrainerConfig(TrainerConfig):
         self._take_poses_of_resumed()
         if self.load_dir is None and self.load_checkpoint is None:
             self.resolve_length()  # resumed runs take it from the checkpoint
-
-    def _seed_by_machine(self) -> None:
-        """Copy --machine.seed, if given, to the other seeds that are not given."""
-        seed, pipeline = self.machine.seed, self.pipeline
-        if seed != MachineConfig().seed:
-            for owner, name in ((pipeline.datamanager, "train_cameras_sampling_seed"), (pipeline.model.train, "seed")):
-                if getattr(owner, name) == type(owner).__dataclass_fields__[name].default:
-                    setattr(owner, name, seed)
 
     def _check_options(self) -> None:
         for options in (self.pipeline.model.scene, self.pipeline.model.train):

@@ -83,18 +83,15 @@ REPEATS = 3  # of timed renders
 def render_milliseconds(render: Callable[[], Any], device: torch.device) -> float:
     """Measure the median time of rendering alone, after a warm-up, waiting for the device each time."""
 
+    wait = torch.cuda.synchronize if device.type == "cuda" else lambda _: None
+
     def timed() -> float:
-        _synchronize(device)
+        wait(device)
         start = time.perf_counter()
         render()
-        _synchronize(device)
+        wait(device)
         return 1000.0 * (time.perf_counter() - start)
 
     with torch.no_grad():
         timed()
         return sorted(timed() for _ in range(REPEATS))[REPEATS // 2]
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

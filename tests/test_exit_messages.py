@@ -98,7 +98,7 @@ def _read(path: Path) -> None:
     ("owner", "name", "read"),
     [
         (sfm_photos, "open_picture", lambda path: sfm_photos.read_photo(path.parent, path.name)),
-        (known_poses, "read_image", lambda path: known_poses._job(["a"], [SimpleNamespace(file=path)], [], path.parent)),
+        (known_poses, "read_image", lambda a: known_poses._job(["a"], [SimpleNamespace(file=a)], [], a.parent)),
         (Image, "open", pictures.open_image),
         (VanillaPipeline, "load_pipeline", lambda _: BitymiPipeline.__new__(BitymiPipeline).load_pipeline({}, 3)),
         (sfm_photos, "open_picture", _read),

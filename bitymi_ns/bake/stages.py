@@ -22,23 +22,9 @@ from bitymi_ns.bundle.write import write_bundle
 from bitymi_ns.codec.limits import RESIDUAL_LIMIT
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.pages import joined, listed_texels, paged_texels, tile_means
-from bitymi_ns.codec.quantise import (
-    Atlas,
-    EncodedAtlas,
-    Range,
-    choose_range,
-    dequantised,
-    encode,
-    round_to_bytes,
-)
+from bitymi_ns.codec.quantise import Atlas, EncodedAtlas, Range, choose_range, dequantised, encode, round_to_bytes
 from bitymi_ns.codec.surfel_codes import Codes, SurfelCodes
-from bitymi_ns.codec.texel_codes import (
-    RESIDUAL_STEP,
-    SceneCodes,
-    TexelCoder,
-    TexelCodes,
-    residual_codes,
-)
+from bitymi_ns.codec.texel_codes import RESIDUAL_STEP, SceneCodes, TexelCoder, TexelCodes, residual_codes
 from bitymi_ns.ops import TexelAlpha, TexelTiles
 from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.progress import Progress, no_progress
@@ -206,10 +192,7 @@ class Coded(Stage):
 
 
 def _coded(
-    stage: Reduced | Rounded,
-    means: Tensor,
-    stored: tuple[Atlas, Tensor] | None = None,
-    codes: SceneCodes | None = None,
+    stage: Reduced | Rounded, means: Tensor, stored: tuple[Atlas, Tensor] | None = None, codes: SceneCodes | None = None
 ) -> Coded:
     """Go on to `Coded` with means [N, C] of the tiles. `stored`: the atlas and its pages; None = no tiles."""
     own = {"in_front": stage.in_front, "codes": codes}

@@ -112,13 +112,7 @@ def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _texels(
-    scene: BakedScene,
-    color: Tensor,
-    rows: Tensor,
-    size: tuple[int, int],
-    radius: Tensor,
-    extent: Tensor,
-    level: float,
+    scene: BakedScene, color: Tensor, rows: Tensor, size: tuple[int, int], radius: Tensor, extent: Tensor, level: float
 ) -> Tensor:
     """Sample the textures [n, r_v, r_u, 4] uint8 of quads of one size."""
     across, down = (torch.linspace(-1.0, 1.0, count) for count in size)

@@ -56,12 +56,7 @@ class SurfaceOptions:
 
 
 @torch.no_grad()
-def median_depth(
-    surfels: Mapping[str, Tensor],
-    camera: Camera,
-    near: float,
-    alpha: TexelAlpha | None = None,
-) -> Tensor:
+def median_depth(surfels: Mapping[str, Tensor], camera: Camera, near: float, alpha: TexelAlpha | None = None) -> Tensor:
     """Compute the median depth [H, W], camera z of the fragment at which the accumulated blending weight reaches 0.5; 0
     if none does. `surfels`: geometry by name (`GEOMETRY`). `near`: near plane, camera z. `alpha`: opacities of the
     surfels' texels; None: opaque texels. Raises TooManyFragments: a single row of screen tiles has more fragments than

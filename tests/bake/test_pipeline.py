@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from bitymi_ns.bake import (
-    BakeOptions,
-    RefineOptions,
-    TuneOptions,
-    bake,
-    bake_field,
-    export,
-)
+from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, bake_field, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.progress import rich_progress
@@ -176,7 +169,7 @@ def test_the_field_may_state_its_centre_for_anisotropic_voxels(scene):
         (BakeOptions(format="bc7", bc7_profile="best"), "profile"),
         (BakeOptions(r_max=50), "r_max"),
         (BakeOptions(page_width=100), "page width"),
-        (BakeOptions(range="sigma1"), "range rule"),
+        (BakeOptions(range="sigma1"), "range must be"),
     ],
 )
 def test_options_out_of_range_are_refused(scene, options, reason):

@@ -9,16 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import (
-    BakeOptions,
-    Coded,
-    Reduced,
-    Stage,
-    Trained,
-    TuneOptions,
-    prune_and_resample,
-    tune_atlas,
-)
+from bitymi_ns.bake import BakeOptions, Coded, Reduced, Stage, Trained, TuneOptions, prune_and_resample, tune_atlas
 from bitymi_ns.bake.field.tiles import field_tiles
 from bitymi_ns.bake.pipeline import trained_texels
 from bitymi_ns.bake.stages import with_means

@@ -8,13 +8,12 @@ import pytest
 from bitymi_ns.bundle import check_files, read_bundle
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.trained import check_run
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
+from tests.typed import Printed
 
 
-def test_it_is_the_default(
-    trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_is_the_default(trained: Run, bundle: Path, tmp_path: Path, capsys: Printed) -> None:
     folder = tmp_path / "b"
     run_export(trained, folder, format=None, tolerance=TOLERANCE, finetune_steps=30, interchange=True, target_mb=9.0)
     out = " ".join(capsys.readouterr().out.split())
@@ -39,7 +38,7 @@ def test_it_is_the_default(
     assert all(check.ok for check in results), results
 
 
-def test_it_can_be_as_small_as_is_asked_for(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
+def test_it_can_be_as_small_as_is_asked_for(trained: Run, tmp_path: Path) -> None:
     fine = {"tolerance": TOLERANCE, "format": "compact", "compact_error": 1e-4}  # makes the scene large
 
     def sizes(name: str, **options) -> dict[str, int]:
@@ -73,6 +72,6 @@ def test_it_can_be_as_small_as_is_asked_for(trained: BitymiTrainerConfig, tmp_pa
         ({"format": None, "exact": True, "interchange": True}, "this bundle's is bc7"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(trained: BitymiTrainerConfig, tmp_path: Path, options, said) -> None:
+def test_options_that_do_not_fit_are_refused(trained: Run, tmp_path: Path, options, said) -> None:
     with pytest.raises(InputError, match=said):
         run_export(trained, tmp_path / "b", **options)

@@ -127,11 +127,7 @@ def test_a_bundle_without_run_has_its_captures_frame(room: Path, tmp_path: Path,
 
 @pytest.mark.slow
 def test_a_runs_capture_was_moved(
-    trained: Run,
-    room: Path,
-    tmp_path: Path,
-    monkeypatch: Patch,
-    capsys: Printed,
+    trained: Run, room: Path, tmp_path: Path, monkeypatch: Patch, capsys: Printed
 ) -> None:
     run = a_run_of(trained, tmp_path)
     rewrite(run, lambda config: setattr(config.pipeline.datamanager, "data", Path("/no/longer/there")))

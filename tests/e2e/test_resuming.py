@@ -82,11 +82,7 @@ def interrupt_at(monkeypatch: Patch, step: int, how: signal.Signals = signal.SIG
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_ctrl_c_saves_what_was_learned(
-    trained: Run,
-    start: Start,
-    monkeypatch: Patch,
-    capsys: Printed,
-    how: signal.Signals,
+    trained: Run, start: Start, monkeypatch: Patch, capsys: Printed, how: signal.Signals
 ) -> None:
     config = start(name="interrupted")
     handler = signal.getsignal(how)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 
 NATIVE = ("***", "Traceback", "terminate called", "Aborted", "Segmentation")
 SCRIPTS = "nerfstudio.scripts."
@@ -28,9 +28,7 @@ def free_port() -> int:
     ("command", "of"),
     [("viewer.run_viewer", "bundle"), ("eval", "bundle"), ("eval", "trained"), ("exporter", "trained")],
 )
-def test_terminated_commands_leave_nothing(
-    command: str, of: str, trained: BitymiTrainerConfig, bundle: Path, tmp_path: Path
-) -> None:
+def test_terminated_commands_leave_nothing(command: str, of: str, trained: Run, bundle: Path, tmp_path: Path) -> None:
     temporary, output = tmp_path / "temporary", tmp_path / "output"
     temporary.mkdir()
     config = (trained.get_base_dir() if of == "trained" else bundle) / "config.yml"

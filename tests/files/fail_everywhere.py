@@ -158,7 +158,7 @@ def check(name: str, write: Write, place: Path, faults: Faults, every: bool) -> 
     return f"{name}: {tried} faults, {len(lines)} messages, {time.perf_counter() - start:.1f} s"
 
 
-def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
+def writers(work: Path) -> dict[str, Callable[[Path, int], Any]]:
     room = generate(work / "room", views=10, width=48, height=36, seed=0, points=200)
     config = small_run(room, work / "outputs")
     config.max_num_iterations, config.steps_per_save = 10, 10
@@ -176,27 +176,19 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
         (bundle / "notes.json").write_bytes(notes())
     state = torch.load(next((run.parent / "nerfstudio_models").glob("*.ckpt")), weights_only=True)
 
-    def frames(version: int) -> Path:
-        path = work / f"path-{version}.json"
+    paths = [work / f"path-{version}.json" for version in range(2)]
+    for version, path in enumerate(paths):
         pose = np.diag([1.0, -1.0, -1.0, 1.0]).flatten().tolist()
         frames = [{"camera_to_world": pose, "fov": fov, "aspect": 4 / 3} for fov in (40.0, 60.0 + version)]
         size = {"render_width": 48, "render_height": 36, "seconds": 1.0, "fps": 2, "camera_path": frames}
         path.write_text(json.dumps(size))
-        return path
-
-    paths = [frames(version) for version in range(2)]
 
     def along(place: Path, version: int, name: str, **options: Any) -> None:
-        render.RenderCameraPath(
-            load_config=bundles[0] / "config.yml",
-            camera_path_filename=paths[version],
-            output_path=place / name,
-            **options,
-        ).main()
+        options |= dict(camera_path_filename=paths[version], output_path=place / name)
+        render.RenderCameraPath(load_config=bundles[0] / "config.yml", **options).main()
 
     def dataset(place: Path, version: int) -> None:
-        names = ["rgb", "raw-depth"]
-        options = dict(load_config=bundles[version] / "config.yml", rendered_output_names=names)
+        options = dict(load_config=bundles[version] / "config.yml", rendered_output_names=["rgb", "raw-depth"])
         render.DatasetRender(output_path=place / "maps", **options).main()
 
     def checkpoint(place: Path, version: int) -> None:
@@ -247,30 +239,32 @@ def writers(work: Path) -> dict[str, Callable[[Path], Write]]:
         return cli.main([str(word) for word in words])
 
     small = ("--views", 10, "--width", 32, "--height", 24, "--points", 60)
+
+    def mesh(place: Path, version: int) -> None:
+        options = dict(resolution=16, format="obj", overwrite=True)
+        ExportMesh(load_config=bundles[version] / "config.yml", output_dir=place / "a", **options).main()
+
+    def evaluate(place: Path, version: int) -> None:
+        ComputePSNR(load_config=(run, bundles[0] / "config.yml")[version], output_path=place / "a.json").main()
+
     return {
-        "sample": lambda p: lambda v: bitymi("sample", "--output-dir", p / "a", *small, "--seed", v, "--overwrite"),
-        "bundle": lambda p: lambda v: export(p / "a", v, overwrite=True),
-        "pack": lambda p: lambda v: bitymi("pack", bundles[v], "--output", p / "a.bitymi", "--overwrite"),
-        "extras": lambda p: lambda v: bitymi("extras", bundles[v], "--output", p / "a", "--overwrite"),
-        "view": lambda p: lambda v: bitymi("view", bundles[v], "--export", p / "a", "--overwrite"),
-        "view-one": lambda p: lambda v: bitymi("view", bundles[v], "--export", p / "a", "--overwrite", "--one-file"),
-        "report": lambda p: lambda v: bitymi("report", report, "--output-dir", p / "a", "--title", f"title {v}"),
-        "mesh": lambda p: (
-            lambda v: ExportMesh(
-                load_config=bundles[v] / "config.yml", output_dir=p / "a", resolution=16, format="obj", overwrite=True
-            ).main()
-        ),
-        "film": lambda p: lambda v: along(p, v, "a.mp4"),
-        "frames": lambda p: lambda v: along(p, v, "a", output_format="images"),
-        "maps": lambda p: partial(dataset, p),
-        "capture": lambda p: partial(capture, p),
-        "model": lambda p: partial(model, p),
-        "checkpoint": lambda p: partial(checkpoint, p),
-        "curve": lambda p: partial(curve, p),
-        "begin": lambda p: partial(begin, p),
-        "eval": lambda p: (
-            lambda v: ComputePSNR(load_config=(run, bundles[0] / "config.yml")[v], output_path=p / "a.json").main()
-        ),
+        "sample": lambda p, v: bitymi("sample", "--output-dir", p / "a", *small, "--seed", v, "--overwrite"),
+        "bundle": lambda p, v: export(p / "a", v, overwrite=True),
+        "pack": lambda p, v: bitymi("pack", bundles[v], "--output", p / "a.bitymi", "--overwrite"),
+        "extras": lambda p, v: bitymi("extras", bundles[v], "--output", p / "a", "--overwrite"),
+        "view": lambda p, v: bitymi("view", bundles[v], "--export", p / "a", "--overwrite"),
+        "view-one": lambda p, v: bitymi("view", bundles[v], "--export", p / "a", "--overwrite", "--one-file"),
+        "report": lambda p, v: bitymi("report", report, "--output-dir", p / "a", "--title", f"title {v}"),
+        "mesh": mesh,
+        "film": lambda p, v: along(p, v, "a.mp4"),
+        "frames": lambda p, v: along(p, v, "a", output_format="images"),
+        "maps": dataset,
+        "capture": capture,
+        "model": model,
+        "checkpoint": checkpoint,
+        "curve": curve,
+        "begin": begin,
+        "eval": evaluate,
     }
 
 
@@ -284,7 +278,8 @@ def main(work: Path, *names: str) -> None:
     for name in names or found:
         place = work / "place" / name
         try:
-            print(check(name, found[name](place), place, faults, os.environ.get("BITYMI_FAULTS") == "all"), flush=True)
+            write = partial(found[name], place)
+            print(check(name, write, place, faults, os.environ.get("BITYMI_FAULTS") == "all"), flush=True)
         except Exception as error:
             wrong.append(name)
             print(f"{name}: WRONG: {''.join(traceback.format_exception(error))}", flush=True)

@@ -8,6 +8,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,21 +52,17 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def put(folder: Path, value: bytes, names: tuple[str, ...]) -> None:
+def of_a_folder(folder: Path, version: int) -> None:
     with files.complete_folder(folder / "b") as new:
-        for name in names:
-            (new / name).write_bytes(value)
+        for name in ("xy", "xz")[version]:
+            (new / name).write_bytes((b"old", b"new")[version] * 999)
 
 
-def of_a_folder(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    return lambda: put(folder, b"old" * 999, ("x", "y")), lambda: put(folder, b"new" * 999, ("x", "z"))
+def of_a_file(folder: Path, version: int) -> None:
+    files.write_file(folder / "b", (b"old", b"new")[version] * 999)
 
 
-def of_a_file(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
-    return lambda: files.write_file(folder / "b", b"old" * 999), lambda: files.write_file(folder / "b", b"new" * 999)
-
-
-def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
+def of_a_bundle(folder: Path, version: int) -> None:
     import torch
 
     from bitymi_ns.bundle import write_bundle
@@ -73,19 +70,16 @@ def of_a_bundle(folder: Path) -> tuple[Callable[[], None], Callable[[], None]]:
 
     torch.set_num_threads(1)
 
-    def version(value: float) -> Callable[[], None]:
-        shapes = {"means": (3, 3), "quats": (3, 4), "log_scales": (3, 2), "opacity_logits": (3,), "beta_raw": (3,)}
-        shapes |= {"sh_dc": (3, 3), "sh_rest": (3, 15, 3)}
-        surfels = {name: torch.full(shape, value) for name, shape in shapes.items()}
-        more = {"extra_files": {"preview.png": b"png"}, "loose_files": {"config.yml": b"config"}}
-        scene = BakedScene(surfels, "sh", torch.zeros(3, 5, dtype=torch.int32))
-        return lambda: write_bundle(folder / "b", scene, overwrite=True, **more) and None
-
-    return version(1.0), version(2.0)
+    shapes = {"means": (3, 3), "quats": (3, 4), "log_scales": (3, 2), "opacity_logits": (3,), "beta_raw": (3,)}
+    shapes |= {"sh_dc": (3, 3), "sh_rest": (3, 15, 3)}
+    surfels = {name: torch.full(shape, version + 1.0) for name, shape in shapes.items()}
+    more = {"extra_files": {"preview.png": b"png"}, "loose_files": {"config.yml": b"config"}}
+    write_bundle(folder / "b", BakedScene(surfels, "sh", torch.zeros(3, 5, dtype=torch.int32)), overwrite=True, **more)
 
 
 def main(kind: str, folder: Path) -> None:
-    old, new = {"folder": of_a_folder, "file": of_a_file, "bundle": of_a_bundle}[kind](folder)
+    write = {"folder": of_a_folder, "file": of_a_file, "bundle": of_a_bundle}[kind]
+    old, new = partial(write, folder, 0), partial(write, folder, 1)
     new()
     newer = contents(folder)
     old()

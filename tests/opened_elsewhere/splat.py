@@ -35,11 +35,7 @@ def gaussians(count: int) -> Gaussians:
 
 @torch.no_grad()
 def draw_gaussians(
-    gaussians: Gaussians,
-    camera: Camera,
-    background: Tensor | None = None,
-    near: float = 0.2,
-    discs: bool = False,
+    gaussians: Gaussians, camera: Camera, background: Tensor | None = None, near: float = 0.2, discs: bool = False
 ) -> Tensor:
     """Render a view.
 

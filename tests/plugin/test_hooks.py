@@ -99,20 +99,12 @@ def test_training_serves_this_machine_alone() -> None:
     assert tyro.cli(type(default), default=default, args=args).viewer.websocket_host == "0.0.0.0"
 
 
-@pytest.mark.parametrize(
-    ("arguments", "host"),
-    [
-        ([], "127.0.0.1"),
-        (["--viewer.websocket-host", "0.0.0.0"], "0.0.0.0"),
-        (["--viewer.websocket_host=0.0.0.0"], "0.0.0.0"),
-        (["--viewer.websocket-host", "10.0.0.5"], "10.0.0.5"),
-    ],
-)
+@pytest.mark.parametrize("given", [[], ["--viewer.websocket-host", "10.0.0.5"], ["--viewer.websocket_host=10.0.0.5"]])
 def test_ns_viewer_listens_where_it_is_told(
-    hosts: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], arguments: Any, host: str
+    hosts: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], given: list[str]
 ) -> None:
-    view(monkeypatch, method_config("bitymi").config, arguments)
-    assert hosts == [host]
+    view(monkeypatch, method_config("bitymi").config, given)
+    assert hosts == ["10.0.0.5" if given else "127.0.0.1"]
     assert "The viewer has ended." in capsys.readouterr().out
 
 

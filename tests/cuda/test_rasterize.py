@@ -11,13 +11,14 @@ from bitymi_ns import ops
 from bitymi_ns.ops import Unlisted
 from bitymi_ns.ops.parameters import GEOMETRY
 from tests.cuda.conftest import HERE, in_orders, only_short_lists
-from tests.ops.golden import SceneCase, camera_of, extreme_scenes, load_golden, random_scene
+from tests.ops.golden import SceneCase, camera_of, extreme_scenes, random_scene
+from tests.ops.test_blend import check_golden
 from tests.ops.test_kernels import relative
+from tests.ops.test_texel import SIZES
 from tests.scene.test_texel_field import make
 from tests.test_api import camera_of as api_camera
 from tests.test_api import surfels
 
-SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 BOUND = 0.03
 
 
@@ -106,20 +107,7 @@ def test_pictures_and_gradients_are_those_of_the_cpu(
 
 
 def test_the_golden_picture_and_gradients(device: torch.device) -> None:
-    """Against the file of the float64 reference."""
-    golden = load_golden("textured")
-    size = torch.tensor([[tile.shape[1], tile.shape[0]] for tile in golden.tiles], device=device)
-    tiles = ops.TexelTiles.of_sizes(size, torch.full((len(size),), 3.0, dtype=torch.float64, device=device))
-    texels = torch.cat([tile.reshape(-1, 3) for tile in golden.tiles]).to(device).requires_grad_()
-    params, camera = {name: value.to(device) for name, value in golden.params.items()}, camera_of(golden)
-    base = ops.view_color("sv", params, params["means"], camera.center.to(device))
-    image, _ = ops.rasterize_image(ops.project(*(params[name] for name in GEOMETRY), camera), base, texels, tiles)
-    rgb = image[:, :3].view(golden.outputs["rgb"].shape)
-    shown = rgb.cpu() + (1 - image[:, 3].cpu().view(*rgb.shape[:2], 1)) * golden.background
-    torch.testing.assert_close(shown, golden.outputs["rgb"], rtol=1e-11, atol=1e-12)
-    (rgb * golden.loss_weights["rgb"].to(device)).sum().backward()
-    want = torch.cat([gradient.reshape(-1, 3) for gradient in golden.tile_grads])
-    torch.testing.assert_close(texels.grad.cpu(), want, rtol=1e-9, atol=1e-12)
+    check_golden(lambda *given: ops.rasterize_image(*given)[0], device)
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Shading and blending in one pass: against separate operations, finite differences and the golden render."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -10,8 +11,8 @@ from bitymi_ns import ops
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.parameters import GEOMETRY
 from tests.ops.golden import SceneCase, camera_of, composite_colors, load_golden, random_scene, reference_colors
+from tests.ops.test_texel import SIZES
 
-SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 BOUND = 0.03
 
 
@@ -112,21 +113,25 @@ def test_gradients_by_finite_differences(textured: bool) -> None:
     assert torch.autograd.gradcheck(image, leaves)
 
 
-def test_the_golden_image_and_the_gradients_of_its_texels() -> None:
+def check_golden(draw: Callable[..., Tensor], device: torch.device | str = "cpu") -> None:
+    """Check a function's picture of the textured scene, and the gradients of its texels, against the golden file."""
     golden = load_golden("textured")
-    sizes = torch.tensor([[tile.shape[1], tile.shape[0]] for tile in golden.tiles])
-    tiles = ops.TexelTiles.of_sizes(sizes, torch.full((len(sizes),), 3.0, dtype=torch.float64))
-    texels = torch.cat([tile.reshape(-1, 3) for tile in golden.tiles]).requires_grad_()
-    camera = camera_of(golden)
-    projection = ops.project(*(golden.params[key] for key in GEOMETRY), camera)
-    base = ops.view_color("sv", golden.params, golden.params["means"], camera.center)
-    image = ops.blended_image(ops.trace(projection), projection, base, texels, tiles)
+    sizes = torch.tensor([[tile.shape[1], tile.shape[0]] for tile in golden.tiles], device=device)
+    tiles = ops.TexelTiles.of_sizes(sizes, torch.full((len(sizes),), 3.0, dtype=torch.float64, device=device))
+    texels = torch.cat([tile.reshape(-1, 3) for tile in golden.tiles]).to(device).requires_grad_()
+    params, camera = {name: value.to(device) for name, value in golden.params.items()}, camera_of(golden)
+    base = ops.view_color("sv", params, params["means"], camera.center.to(device))
+    image = draw(ops.project(*(params[key] for key in GEOMETRY), camera), base, texels, tiles).cpu()
     rgb = image[:, :3].view_as(golden.outputs["rgb"])
     alpha = image[:, 3:4].view(*rgb.shape[:2], 1)
     torch.testing.assert_close(rgb + (1 - alpha) * golden.background, golden.outputs["rgb"], rtol=1e-11, atol=1e-12)
     (rgb * golden.loss_weights["rgb"]).sum().backward()
     want = torch.cat([grad.reshape(-1, 3) for grad in golden.tile_grads])
-    torch.testing.assert_close(texels.grad, want, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(texels.grad.cpu(), want, rtol=1e-9, atol=1e-12)
+
+
+def test_the_golden_image_and_the_gradients_of_its_texels() -> None:
+    check_golden(lambda projection, *given: ops.blended_image(ops.trace(projection), projection, *given))
 
 
 @pytest.mark.parametrize("textured", [False, True], ids=["surfels", "texels"])

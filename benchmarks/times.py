@@ -24,7 +24,7 @@ from torch.nn.functional import l1_loss
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.measure.bench.cli import BenchRun
-from bitymi_ns.measure.bench.process import say
+from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.markdown import number, page, publish, table
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.baked_cuda import Stage
@@ -330,10 +330,13 @@ def nerfstudio(
     Args:
         data: Folder of a capture.
         steps: Length of the run.
-        extra: Further options of ns-train, as one word.
+        extra: Further options of ns-train, as one word: --extra="--mixed-precision False".
         work: Folder of runs, bundles, logs and finished cells.
     """
-    return BenchRun((data,), steps=steps, extra=extra, formats=("bc7",), work=work).run()
+    try:
+        return BenchRun((data,), steps=steps, extra=extra, formats=("bc7",), work=work).run()
+    except BenchError as error:
+        raise SystemExit(f"times.py: {error}") from error
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ import os
 import shlex
 import sys
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -57,20 +56,17 @@ def publish(text: str, output: Path | None) -> None:
             write_file(output, text.encode("utf8"), follow=True)
 
 
-@lru_cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("bitymi_ns.measure", "templates"),
-        autoescape=select_autoescape(("html.j2",)),
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    environment.filters["data_uri"] = lambda data, mime: f"data:{mime};base64,{base64.b64encode(data).decode('ascii')}"
-    return environment
+TEMPLATES = Environment(
+    loader=PackageLoader("bitymi_ns.measure", "templates"),
+    autoescape=select_autoescape(("html.j2",)),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+TEMPLATES.filters["data_uri"] = lambda data, mime: f"data:{mime};base64,{base64.b64encode(data).decode('ascii')}"
 
 
 def rendered(template: str, **values: Any) -> str:
     """Render a template. Values are escaped in .html.j2; an undefined name is an error."""
-    return _environment().get_template(template).render(**values)
+    return TEMPLATES.get_template(template).render(**values)

@@ -30,12 +30,11 @@ def write_capture(poses: FoundPoses, folder: Path, progress: Progress) -> None:
     model = pycolmap.Reconstruction(poses.model)
     names = sorted(image.name for image in model.images.values() if image.has_pose)
     with complete_folder(folder, check) as new:
-        for i, name in enumerate(names):
-            progress("copying photographs", i, len(names))
+        for i, name in enumerate(names, 1):
             target = inside(new / "images", name)
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(poses.images / name, target)
-        progress("copying photographs", len(names), len(names))
+            progress("copying photographs", i, len(names))
         copy_files(poses.model, new / "sparse" / "0")
         points = model.points3D.values()
         xyz, rgb = (np.reshape([getattr(point, name) for point in points], (-1, 3)) for name in ("xyz", "color"))

@@ -84,15 +84,14 @@ def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[lis
     with ThreadPoolExecutor() as pool:
         pending = [pool.submit(read_photo, folder, name) for name in names]
         try:
-            for i, (name, result) in enumerate(zip(names, pending, strict=True)):
-                progress("reading photographs", i, len(names))
+            for i, (name, result) in enumerate(zip(names, pending, strict=True), 1):
                 try:
                     photos.append(result.result())
                 except CaptureError as error:
                     broken[name] = str(error)
+                progress("reading photographs", i, len(names))
         finally:
             pool.shutdown(cancel_futures=True)
-    progress("reading photographs", len(names), len(names))
     return photos, broken
 
 

@@ -67,13 +67,12 @@ def make_views(
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
     masks: list[Any] = [photographs[i].mask for i in sources]  # some may have none
-    side = frame.scene_scale
     views = Views(
         image_filenames=names,
         cameras=cameras,
         alpha_color=alpha_color,
         metadata=metadata,
-        scene_box=SceneBox(aabb=torch.tensor([[-side] * 3, [side] * 3], dtype=torch.float32)),
+        scene_box=SceneBox(aabb=torch.tensor([[-1.0] * 3, [1.0] * 3]) * frame.scene_scale),
         mask_filenames=masks if any(masks) else None,
         dataparser_scale=scale * capture.applied_scale,
         dataparser_transform=torch.from_numpy(transform if capture.applied is None else transform @ capture.applied),

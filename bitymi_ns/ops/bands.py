@@ -147,7 +147,7 @@ def band(projection: Projection, top: int, bottom: int) -> Projection:
     """
     shift = projection.geom.new_zeros(projection.geom.shape[1])
     shift[1] = top
-    camera = projection.camera.rows(top, bottom)
+    camera = projection.camera.part(0, top, projection.camera.width, bottom)
     return replace(projection, geom=projection.geom - shift, camera=camera, whole=projection)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -112,23 +112,18 @@ class BakedScene:
 
     def to(self, device: torch.device | str) -> BakedScene:
         """Move the surfels to a device; texels are uploaded as textures at the first render."""
-
-        def moved(t: Tensor | None) -> Tensor | None:
-            return None if t is None else t.to(device)
-
-        surfels = {name: value.to(device) for name, value in self.surfels.items()}
-        optional = {name: moved(getattr(self, name)) for name in ("extent", "mean_residual", "mean_alpha")}
-        return replace(self, surfels=surfels, tiles=self.tiles.to(device), **optional)
+        return self._changed(lambda name, value: value.to(device))
 
     def only(self, kept: Tensor) -> BakedScene:
         """Keep the surfels for which `kept` [N] is True; texels and terms of view colours stay."""
+        return self._changed(lambda name, value: value if name == "view_terms" else value[kept.to(value.device)])
 
-        def some(t: Tensor | None) -> Tensor | None:
-            return None if t is None else t[kept.to(t.device)]
-
-        surfels = {name: value if name == "view_terms" else some(value) for name, value in self.surfels.items()}
-        optional = {name: some(getattr(self, name)) for name in ("extent", "mean_residual", "mean_alpha")}
-        return replace(self, surfels=surfels, tiles=some(self.tiles), **optional)
+    def _changed(self, change: Callable[[str, Tensor], Tensor]) -> BakedScene:
+        """Change the arrays of the surfels, given their names."""
+        surfels = {name: change(name, value) for name, value in self.surfels.items()}
+        arrays = {name: getattr(self, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
+        arrays = {name: change(name, value) for name, value in arrays.items() if value is not None}
+        return replace(self, surfels=surfels, **arrays)
 
     def __len__(self) -> int:
         return len(self.tiles)

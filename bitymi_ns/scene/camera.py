@@ -90,10 +90,6 @@ class Camera:
         local = torch.stack([(x - K[0, 2]) / K[0, 0] * z, (y - K[1, 2]) / K[1, 1] * z, z], -1)
         return (local - viewmat[:3, 3]) @ viewmat[:3, :3]
 
-    def rows(self, top: int, bottom: int) -> Camera:
-        """Crop the image to rows `top` to `bottom` (exclusive)."""
-        return self.part(0, top, self.width, bottom)
-
     def part(self, left: int, top: int, right: int, bottom: int) -> Camera:
         """Crop the image to columns `left` to `right` and rows `top` to `bottom` (both ends exclusive)."""
         shift = torch.zeros_like(self.K)

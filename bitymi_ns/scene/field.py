@@ -23,45 +23,7 @@ def _current(cached: tuple[Tensor, int, T] | None, buffer: Tensor) -> T | None:
     return cached[2] if cached is not None and cached[0] is buffer and cached[1] == version_of(buffer) else None
 
 
-class ResidualField(nn.Module):
-    """Residual colours of fragments, added to the surfels' view-dependent colours."""
-
-    def residual(
-        self,
-        fragments: Fragments,
-        frames: Tensor,
-        bound: float,
-        learns: bool,
-        descent: TexelDescent | None = None,
-        read: Tensor | None = None,
-    ) -> dict[str, Any]:
-        """Compute the residual of a view, as arguments of `blended_image`.
-
-        Args:
-            frames: [N, 9] of the view's `Projection`.
-            bound: fragments of smaller weight have no residual.
-            learns: compute gradients.
-            descent: update of learning texels by the backward pass; None: they get a gradient.
-            read: copy of the texels before the backward pass, for a view rendered in bands.
-        """
-        found = self.texture(bound, learns, descent, read)
-        if found is None:
-            raise NotImplementedError
-        return found
-
-    def texture(
-        self, bound: float, learns: bool, descent: TexelDescent | None = None, read: Tensor | None = None
-    ) -> dict[str, Any] | None:
-        """Return the arguments of `blended_image` if the residual is a texture (texels [T, 3], tiles), else None.
-        Arguments as in `residual`."""
-        return None
-
-    def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
-        """Return opacities of texels, with or without gradients, see `ops.TexelAlpha`; None: opaque texels."""
-        return None
-
-
-class HashField(ResidualField):
+class HashField(nn.Module):
     """Multiresolution hash grid and MLP: view-independent residual colour rho(x), eq. (color).
 
     The last layer is initialised with 0, and so the residual is 0; table entries with U(-1e-4, 1e-4).
@@ -116,18 +78,11 @@ class HashField(ResidualField):
         """Table and MLP weights, in the order of the arguments of `ops.field`."""
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
-    def residual(
-        self,
-        fragments: Fragments,
-        frames: Tensor,
-        bound: float,
-        learns: bool,
-        descent: TexelDescent | None = None,
-        read: Tensor | None = None,
-    ) -> dict[str, Any]:
+    def residual(self, fragments: Fragments, frames: Tensor, bound: float, learns: bool) -> Tensor:
+        """Compute the residual colours [F, 3] of a view's fragments, with or without gradients. `frames`: [N, 9] of its
+        `Projection`. `bound`: fragments of smaller weight have none."""
         weights = self.weights if learns else tuple(w.detach() for w in self.weights)
-        moves = learns and self._moves_surfels
-        return {"residual": fragment_residual(fragments, frames, self.geometry, weights, bound, moves)}
+        return fragment_residual(fragments, frames, self.geometry, weights, bound, learns and self._moves_surfels)
 
     def forward(self, x: Tensor) -> Tensor:
         """Compute the residual colour [M, 3] at world positions [M, 3]."""
@@ -146,7 +101,7 @@ class HashField(ResidualField):
         return (4 * g.half / finest) * torch.stack([r * r, r / (2 - 1 / r)], dim=-1)
 
 
-class TexelField(ResidualField):
+class TexelField(nn.Module):
     """Residual colours of N surfels in texels, one tile per surfel, as in a bundle.
 
     Args:
@@ -208,6 +163,14 @@ class TexelField(ResidualField):
     def texture(
         self, bound: float, learns: bool, descent: TexelDescent | None = None, read: Tensor | None = None
     ) -> dict[str, Any]:
+        """Return the arguments of `blended_image`.
+
+        Args:
+            bound: fragments of smaller weight have no residual.
+            learns: compute gradients.
+            descent: update of the texels by the backward pass; None: they get a gradient.
+            read: copy of the texels before the backward pass, for a view rendered in bands.
+        """
         texels = self.texels if learns and descent is None else self.texels.detach()
         if descent is not None and read is not None:
             texels, descent = read, replace(descent, moved=texels)
@@ -215,6 +178,7 @@ class TexelField(ResidualField):
         return {"texels": texels, "tiles": self.tiles, "bound": bound, "move_surfels": learns, "descent": descent}
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
+        """Return opacities of texels, with or without gradients, see `ops.TexelAlpha`; None: opaque texels."""
         if self.alpha is None:
             return None
         return TexelAlpha(self.tiles, self.alpha if learns else self.alpha.detach(), bound)

@@ -110,17 +110,8 @@ def sampling_of(size: float, pixels: int) -> Sampling:
 
 
 def averaged(images: dict[str, Tensor], samples: int) -> dict[str, Tensor]:
-    """Downsample supersampled images.
-
-    Args:
-        images: name -> [views, samples * height, samples * width, channels].
-        samples: per pixel along each axis.
-
-    Returns:
-        name -> [views, height, width, channels]: means, but sums of integers (counts).
-    """
-    if samples == 1:
-        return images
+    """Downsample images [views, samples * height, samples * width, channels] by name to [views, height, width,
+    channels]: means, but sums of integers (counts)."""
     out = {}
     for name, image in images.items():
         total = image
@@ -131,13 +122,8 @@ def averaged(images: dict[str, Tensor], samples: int) -> dict[str, Tensor]:
 
 
 def padded(image: Tensor, part: Part, size: tuple[int, int], around: Tensor | None = None) -> Tensor:
-    """Pad images of a part of views to whole views.
-
-    Args:
-        image: [views, rows, columns, channels] of the part.
-        size: height and width of the views.
-        around: [channels] value of the padding; None = 0.
-    """
+    """Pad images [views, rows, columns, channels] of a part of views to whole views of `size`, height and width, with
+    the value `around` [channels]; None: 0."""
     left, top, right, bottom = part
     whole = image.new_zeros(len(image), *size, image.shape[-1])
     if around is not None:

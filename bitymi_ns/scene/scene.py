@@ -13,6 +13,7 @@ from bitymi_ns.ops import (
     VIEW_COLORS,
     Fragments,
     Projection,
+    TexelAlpha,
     TexelDescent,
     Unlisted,
     blended_image,
@@ -31,7 +32,7 @@ from bitymi_ns.ops.training_view import ComparedView, PhotographTarget, training
 
 from .camera import Camera
 from .config import SceneConfig
-from .field import ResidualField, TexelField
+from .field import HashField, TexelField
 
 NEAR = 0.02  # near plane for cameras of extent 1
 
@@ -112,7 +113,11 @@ class Scene(nn.Module):
     """
 
     def __init__(
-        self, config: SceneConfig, surfels: Mapping[str, Tensor], field: ResidualField | None, near: float = NEAR
+        self,
+        config: SceneConfig,
+        surfels: Mapping[str, Tensor],
+        field: HashField | TexelField | None,
+        near: float = NEAR,
     ) -> None:
         super().__init__()
         names = (*GEOMETRY, *VIEW_COLORS[config.view_color].names)
@@ -145,6 +150,10 @@ class Scene(nn.Module):
         center = projection.camera.exact_center
         return view_color(self.config.view_color, self.surfels, means, center, projection.visible)
 
+    def opacity(self, learns: bool) -> TexelAlpha | None:
+        """Return the opacities of texels, with or without gradients; None: opaque texels, or none."""
+        return self.field.opacity(self.config.weight_bound, learns) if isinstance(self.field, TexelField) else None
+
     def _surfels_with(self, opacity_logits: Tensor | None) -> Tensors:
         return self.surfels if opacity_logits is None else {**self.surfels, "opacity_logits": opacity_logits}
 
@@ -153,7 +162,7 @@ class Scene(nn.Module):
         self,
         camera: Camera,
         background: Tensor | None = None,
-        field_mode: Literal["train", "frozen", "off"] = "train",
+        field_mode: Literal["train", "frozen"] = "train",
         maps: bool = False,
         overdraw_half: float | None = None,
         descent: TexelDescent | None = None,
@@ -166,7 +175,7 @@ class Scene(nn.Module):
 
         Args:
             background: [3] colour behind the scene; None: black.
-            field_mode: train = residual with gradients; frozen = residual without gradients; off = no residual.
+            field_mode: train = residual with gradients; frozen = residual without gradients.
             maps: also render depth and normals.
             overdraw_half: also render the soft overdraw, see `ops.soft_overdraw`; None: no.
             descent: update of the texels of a `TexelField` by the backward pass; None: they get a gradient.
@@ -176,13 +185,11 @@ class Scene(nn.Module):
             TooManyFragments: a single row of screen tiles has too many.
             MemoryError: the picture does not fit into memory.
         """
-        p = self._surfels_with(opacity_logits)
-        field = None if field_mode == "off" else self.field
+        p, field = self._surfels_with(opacity_logits), self.field
         learns, bound = field_mode == "train", self.config.weight_bound
         descent = descent if learns else None
-        alpha = None if self.field is None else self.field.opacity(bound, learns)
-        projection = project(*geometry_of(p), camera=camera, near=self.near, alpha=alpha)
-        texture = None if maps or overdraw_half is not None else self._unlisted_texture(field_mode, descent)
+        projection = project(*geometry_of(p), camera=camera, near=self.near, alpha=self.opacity(learns))
+        texture = None if maps or overdraw_half is not None else self._unlisted_texture(learns, descent)
         base = self.base_color(projection)
         if texture is not None:
             image, fragments = rasterize_image(projection, base, **texture, rim=self.config.rim)
@@ -194,8 +201,12 @@ class Scene(nn.Module):
             if part.whole is not None and read is None and descent is not None and isinstance(field, TexelField):
                 read = field.texels.detach().clone()  # a band's backward pass moves texels that others read again
             fragments = trace(part, self.config.rim, most)
-            residual = {} if field is None else field.residual(fragments, part.frames, bound, learns, descent, read)
-            image = blended_image(fragments, part, base, maps=maps, **residual)
+            shading: dict[str, Any] = {}
+            if isinstance(field, TexelField):
+                shading = field.texture(bound, learns, descent, read)
+            elif field is not None:
+                shading["residual"] = field.residual(fragments, part.frames, bound, learns)
+            image = blended_image(fragments, part, base, maps=maps, **shading)
             if overdraw_half is not None:
                 image = torch.cat([image, soft_overdraw(fragments, overdraw_half).unsqueeze(1)], 1)
             return image, fragments
@@ -203,15 +214,12 @@ class Scene(nn.Module):
         image, fragments = draw_by_lists(projection, draw, self.config.max_fragments, self.config.rim)
         return RenderOutput.of_image(image, projection, fragments, background, maps, overdraw_half is not None)
 
-    def _unlisted_texture(
-        self, field_mode: Literal["train", "frozen", "off"], descent: TexelDescent | None
-    ) -> dict[str, Any] | None:
+    def _unlisted_texture(self, learns: bool, descent: TexelDescent | None) -> dict[str, Any] | None:
         """Return the texel arguments of `rasterize_image`, {} without texels; None if views need fragment lists."""
-        if self.config.max_fragments or not can_rasterize(self.surfels["means"].device):
+        by_lists = self.config.max_fragments or not can_rasterize(self.surfels["means"].device)
+        if by_lists or isinstance(self.field, HashField):
             return None
-        if self.field is None or field_mode == "off":
-            return None if isinstance(self.field, TexelField) and self.field.alpha is not None else {}
-        return self.field.texture(self.config.weight_bound, field_mode == "train", descent)
+        return {} if self.field is None else self.field.texture(self.config.weight_bound, learns, descent)
 
     def compare(
         self,
@@ -225,10 +233,10 @@ class Scene(nn.Module):
         """Draw a view and compare it with its photograph, see `ops.training_view`; None if views need fragment lists.
         `correction`: colour correction, [3] or [3, 4], see `train.views.View`. `field_mode`, `descent`,
         `opacity_logits`: as in `render`."""
-        texture = self._unlisted_texture(field_mode, descent if field_mode == "train" else None)
+        learns = field_mode == "train"
+        texture = self._unlisted_texture(learns, descent if learns else None)
         if texture is None:
             return None
-        alpha = None if self.field is None else self.field.opacity(self.config.weight_bound, field_mode == "train")
-        view = {"near": self.near, "rim": self.config.rim, "alpha": alpha}
+        view = {"near": self.near, "rim": self.config.rim, "alpha": self.opacity(learns)}
         surfels = self._surfels_with(opacity_logits)
         return training_view(self.config.view_color, surfels, camera, photograph, correction, **texture, **view)

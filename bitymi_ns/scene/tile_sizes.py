@@ -81,7 +81,6 @@ def nyquist_resolution(
     Returns:
         [N, 2] int32 (r_u, r_v), powers of two in [r_min, r_max].
     """
-    check_sides(r_min, r_max)
     resolution = next_power_of_two(4.0 * extent * scales / delta)  # [N, 2]
     if max_pixels is not None:
         resolution = torch.minimum(resolution, next_power_of_two(max_pixels))
@@ -89,29 +88,15 @@ def nyquist_resolution(
 
 
 def seen_sides(pixels: Tensor, r_min: int = 4, r_max: int = 64) -> Tensor:
-    """Compute tile resolutions from the training views' resolution alone.
-
-    Args:
-        pixels: [N, 2] largest projected extent of the tile over the training views.
-        r_min, r_max: smallest and largest resolution, powers of two >= 4.
-
-    Returns:
-        [N, 2] int32 (r_u, r_v), powers of two in [r_min, r_max].
-    """
+    """Compute tile resolutions from the training views' resolution alone: [N, 2] int32 (r_u, r_v), powers of two in
+    [r_min, r_max], from the largest projected extents `pixels` [N, 2]. Raises ValueError: as `check_sides`."""
     check_sides(r_min, r_max)
     return next_power_of_two(pixels).clamp(r_min, r_max).to(torch.int32)
 
 
 def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
-    """Halve the longer side of tiles until they have at most `texels` texels, or both sides are `r_min`.
-
-    Args:
-        sides: [N, 2] int32 (r_u, r_v), powers of two of at least `r_min`.
-        texels: [N] maximum number of texels of each tile.
-
-    Returns:
-        [N, 2] int32.
-    """
+    """Halve the longer of the sides [N, 2] int32 of tiles, powers of two, until they have at most `texels` [N] texels
+    each, or both sides are `r_min`."""
     sides = sides.clone()
     while True:
         wide = sides[:, 0] >= sides[:, 1]
@@ -132,10 +117,8 @@ def max_projected_extent(
     extents.
 
     Args:
-        means: [N, 3] world positions.
+        means, scales: [N, 3] positions and [N, 2] tangent scales, world units.
         axes: [N, 3, 2] unit tangent directions, world frame.
-        scales: [N, 2] tangent scales, world units.
-        cameras: training views.
         extent: half side of the tile in scale units.
         near: near plane, camera z.
 

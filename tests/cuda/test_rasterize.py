@@ -199,9 +199,8 @@ def test_which_pictures_of_a_scene_need_no_list(device: torch.device) -> None:
     for output in (*unlisted, *lists):
         assert len(output.fragments) == len(lists[0].fragments)
         torch.testing.assert_close(output.rgb, lists[0].rgb, rtol=1e-9, atol=1e-12)
-    assert isinstance(scene.render(camera, field_mode="off").fragments, ops.Fragments)  # alphas without their colours
-    scene.field.alpha = None
-    assert isinstance(scene.render(camera, field_mode="off").fragments, Unlisted)
+    scene.field = None
+    assert isinstance(scene.render(camera).fragments, Unlisted)
 
 
 def test_the_public_function_lists_for_maps_alone(device: torch.device) -> None:

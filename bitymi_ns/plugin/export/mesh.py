@@ -108,7 +108,7 @@ def from_run(load_config: Path) -> MeshScene:
     scene = model.scene
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     world = WorldEntry.model_validate_json(json.dumps(plain(world_of(datamanager).described())))
-    alpha = None if scene.field is None else scene.field.opacity(scene.config.weight_bound, learns=False)
+    alpha = scene.opacity(learns=False)
     drawn = (cameras, scene.near, world, alpha)
     return MeshScene(surfels, lambda camera: model.render(camera, model.background, maps=False).rgb, *drawn)
 

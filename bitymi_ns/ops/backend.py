@@ -110,10 +110,10 @@ def module(device: torch.device) -> ModuleType:
 def lookup(name: str, device: torch.device) -> Any:
     """Return a function or class of the kernel module for a device by name. Raises RuntimeError: the kernels for that
     device are not built, or lack it."""
-    found = getattr(module(device), name, None)
-    if found is None:
+    kernel_or_class = getattr(module(device), name, None)
+    if kernel_or_class is None:
         raise RuntimeError(f"there is no kernel {name} for tensors on '{device}': move them to another device")
-    return found
+    return kernel_or_class
 
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:

@@ -100,8 +100,8 @@ def draw(
         maps = any(name not in ("rgb", "alpha") for name in images)
         image, overdraw = frame(scene, camera, maps, photo_pixel)
         for name, views in drawn.items():
-            found = overdraw if name == "overdraw" and overdraw is not None else image[..., CHANNELS[name]]
+            view = overdraw if name == "overdraw" and overdraw is not None else image[..., CHANNELS[name]]
             if name == "rgb" and background is not None:
-                found = found + (1 - image[..., CHANNELS["alpha"]]) * background
-            views.append(found)
+                view = view + (1 - image[..., CHANNELS["alpha"]]) * background
+            views.append(view)
     return {name: views[0][None] if len(views) == 1 else torch.stack(views) for name, views in drawn.items()}

@@ -110,8 +110,8 @@ def fragment_residual(
     if not move_surfels:
         frames = frames.detach()
     rows = (fragments.weight.detach() >= bound).nonzero().squeeze(1)
-    at = frames.index_select(0, fragments.surfel.index_select(0, rows))
+    placed = frames.index_select(0, fragments.surfel.index_select(0, rows))
     uv = fragments.uv if move_surfels else fragments.uv.detach()
     u, v = uv.index_select(1, rows).unsqueeze(2)
-    x = at[:, :3] + u * at[:, 3:6] + v * at[:, 6:]
+    x = placed[:, :3] + u * placed[:, 3:6] + v * placed[:, 6:]
     return frames.new_zeros(len(fragments), 3).index_copy(0, rows, field(x, geometry, *weights))

@@ -29,8 +29,8 @@ class Parameter:
     name: str  # as in checkpoints and optimiser groups
     shape: tuple[int, ...]  # of a row; -1 = number of terms, less the one that the first parameter may hold
     limit: Limit  # allowed in a bundle
-    rate: str  # learning rate, a field of `train.config.LearningRates`,
-    share: float = 1.0  # and its factor
+    rate: str  # learning rate, a field of `train.config.LearningRates`, multiplied by:
+    rate_factor: float = 1.0
     activation: str | None = None  # activation of a view colour as stated in bundle.json; None: not stated
     columns: tuple[str, ...] | None = None  # columns of surfels.ply; None: <name>_<i>
     code: str | None = None  # column of surfels.bin; None: its name

@@ -200,13 +200,13 @@ def refuse_skew(camera: CameraLike) -> None:
 def geometry_of(surfels: Tensors) -> list[Tensor]:
     """List the surfels' parameters of `GEOMETRY`; one that is missing has the value `Parameter.absent`. Raises
     KeyError: it has none."""
-    means, found = surfels["means"], []
+    means, geometry = surfels["means"], []
     for name, parameter in GEOMETRY_PARAMETERS.items():
         if name in surfels or parameter.absent is None:
-            found.append(surfels[name])
+            geometry.append(surfels[name])
         else:
-            found.append(means.new_full((len(means), *parameter.shape), parameter.absent))
-    return found
+            geometry.append(means.new_full((len(means), *parameter.shape), parameter.absent))
+    return geometry
 
 
 def checked_geometry(geometry: Sequence[Tensor], camera: CameraLike) -> Sequence[Tensor]:

@@ -100,9 +100,9 @@ class _Trace(torch.autograd.Function):
     @staticmethod
     def forward(ctx, geom, texel_alpha, projection, rim, most):
         find_fragments = trace_cuda.find_fragments if cuda_backend(geom.device) else trace_cpu.find_fragments
-        layout, found = find_fragments(geom.detach(), projection, most)
-        weight, uv, depth, sigma = (found[name] for name in ("weight", "uv", "depth", "sigma"))
-        arrays = _for_layout(found, layout)
+        layout, listed = find_fragments(geom.detach(), projection, most)
+        weight, uv, depth, sigma = (listed[name] for name in ("weight", "uv", "depth", "sigma"))
+        arrays = _for_layout(listed, layout)
         ctx.save_for_backward(geom, *arrays.values())
         ctx.projection, ctx.rim, ctx.layout, ctx.names = projection, rim, layout, tuple(arrays)
         ctx.mark_non_differentiable(sigma)
@@ -180,5 +180,5 @@ def select(fragments: Fragments, keep: Tensor) -> Fragments:
     check_shapes(keep=(keep, fragments.weight.shape))
     by = trace_cuda if cuda_backend(keep.device) else trace_cpu
     width, height = fragments.width, fragments.height
-    layout, found = by.select(fragments.layout, fragments._numbers, keep, width, height)
-    return Fragments(**found, width=width, height=height, layout=layout, surfels=fragments.surfels)
+    layout, listed = by.select(fragments.layout, fragments._numbers, keep, width, height)
+    return Fragments(**listed, width=width, height=height, layout=layout, surfels=fragments.surfels)

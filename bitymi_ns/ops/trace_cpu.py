@@ -50,14 +50,14 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
         if most and n > most:
             raise TooManyFragments(geom, projection, n, most, ids=False)
         try:
-            found = empty_list(geom, n)
+            listed = empty_list(geom, n)
         except RuntimeError as error:  # of torch's allocator
             if not most or not out_of_memory(error):
                 raise
             raise TooManyFragments(geom, projection, n, n // 2, ids=False) from error
         arrays = _empty_layout(tracer.tiles, tracer.blocks)
-        tracer.copy(**found, **arrays)
-    return _layout(arrays, projection.camera.width, projection.camera.height), found
+        tracer.copy(**listed, **arrays)
+    return _layout(arrays, projection.camera.width, projection.camera.height), listed
 
 
 def select(
@@ -70,13 +70,13 @@ def select(
         keep: [F] bool.
         width, height: of the image, pixels.
     """
-    found = empty_list(numbers["weight"], int(keep.sum()))
+    listed = empty_list(numbers["weight"], int(keep.sum()))
     arrays = _empty_layout(len(layout.arrays["tile_start"]) - 1, len(layout.arrays["blocks"]))
-    kept = {f"kept_{name}": values for name, values in found.items()}
+    kept = {f"kept_{name}": values for name, values in listed.items()}
     flags = keep.contiguous().view(torch.uint8)
     kernel("select_fragments", numbers["weight"])(layout=layout.handle, keep=flags, **numbers, **kept, **arrays)
     arrays["blocks"] = arrays["blocks"][: int(arrays["block_start"][-1])].clone()
-    return _layout(arrays, width, height), found
+    return _layout(arrays, width, height), listed
 
 
 def _empty_layout(tiles: int, blocks: int) -> dict[str, Tensor]:

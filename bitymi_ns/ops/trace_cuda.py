@@ -49,12 +49,12 @@ def fill(geom: Tensor, projection: Projection, layout: Layout) -> dict[str, Tens
     """Compute the numbers of `Fragments` by name; raises TooManyFragments if memory is insufficient."""
     count = layout.handle.fragments
     try:
-        found, ids = empty_list(geom, count), layout.ids()
+        listed, ids = empty_list(geom, count), layout.ids()
     except torch.cuda.OutOfMemoryError as error:
         raise TooManyFragments(geom, projection, count, fragment_capacity(geom), ids=True) from error
     view = projection.view(geom) | projection.alpha_arrays
-    kernel("trace_fill", geom)(**view, **found, **ids, layout=layout.handle)
-    return found
+    kernel("trace_fill", geom)(**view, **listed, **ids, layout=layout.handle)
+    return listed
 
 
 def find_fragments(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Layout, dict[str, Tensor]]:
@@ -91,8 +91,8 @@ def select(
     function("select_fragments", keep.device)(layout=layout.handle, keep=flags, masks=masks, counts=counts)
     offsets, rows = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), keep.nonzero().squeeze(1)
     ids = {name: value[rows] for name, value in layout.ids().items()}
-    found = {name: value[..., rows].contiguous() for name, value in numbers.items()}
-    return layout_of(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids), found
+    listed = {name: value[..., rows].contiguous() for name, value in numbers.items()}
+    return layout_of(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids), listed
 
 
 def backward_memory(geom: Tensor, layout: Layout, texel_alpha: Tensor | None) -> dict[str, Tensor]:

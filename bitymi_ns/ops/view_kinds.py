@@ -133,8 +133,8 @@ def _sg_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Te
 def _sg_mean(base: Tensor, lobes: Tensor) -> Tensor:
     """Average over the sphere: exp(l (d.mu - 1)) has the mean (1 - exp(-2l)) / 2l."""
     sharpness = lobes[..., 3].exp().clamp(1e-6, 1e6)
-    share = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
-    return base + (lobes[..., 4:] * share[..., None]).sum(1)
+    mean = -torch.expm1(-2.0 * sharpness) / (2.0 * sharpness)
+    return base + (lobes[..., 4:] * mean[..., None]).sum(1)
 
 
 _COLOR: Limit = (COLOR_LIMIT,)
@@ -199,7 +199,7 @@ VIEW_COLORS: dict[str, ViewColor] = {
         kept="Coefficients",
         parameters=(
             Parameter("sh_dc", (3,), _COLOR, "view_color"),
-            Parameter("sh_rest", (-1, 3), _COLOR, "view_color", share=1.0 / 20.0),
+            Parameter("sh_rest", (-1, 3), _COLOR, "view_color", rate_factor=1.0 / 20.0),
         ),
         counts=(1, 4, 9, 16),
         rule="sh_rest must hold 0, 3, 8 or 15 coefficients",

@@ -78,15 +78,16 @@ def part_of(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], near: floa
         local = camera.local(surfels["means"])
         shown = local.isfinite().all(1) & (local[:, 2] > near)
         (x, y, z), radius = local[shown].unbind(1), reach[shown]
-        for axis, at in enumerate((x / z, y / z)):
-            half = torch.where(z > radius, radius * (1 + at.abs()) / (z - radius), math.inf)
-            ends = torch.stack([at - half, -at - half]).amin(1) if len(z) else at.new_zeros(2)
+        for axis, slope in enumerate((x / z, y / z)):
+            half = torch.where(z > radius, radius * (1 + slope.abs()) / (z - radius), math.inf)
+            ends = torch.stack([slope - half, -slope - half]).amin(1) if len(z) else slope.new_zeros(2)
             bounds.append(ends * camera.K[axis, axis] + torch.stack([camera.K[axis, 2], -camera.K[axis, 2]]))
     low, high = torch.stack(bounds).view(-1, 2, 2).amin(0).unbind(1)
     size = cameras[0].width, cameras[0].height
-    first = [int(min(max(at - RIM, 0), side - 1)) for at, side in zip(low.tolist(), size, strict=True)]
+    first = [int(min(max(begin - RIM, 0), side - 1)) for begin, side in zip(low.tolist(), size, strict=True)]
     last = [
-        math.ceil(max(min(RIM - at, side), to + 1)) for at, side, to in zip(high.tolist(), size, first, strict=True)
+        math.ceil(max(min(RIM - end, side), begin + 1))
+        for end, side, begin in zip(high.tolist(), size, first, strict=True)
     ]
     return first[0], first[1], last[0], last[1]
 

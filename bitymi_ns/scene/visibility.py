@@ -106,7 +106,7 @@ def _sees(camera: Camera, means: Tensor, radii: Tensor, near: float) -> bool:
     camera = camera.to(means.device)
     x, y, z, _ = camera.project(means, near)
     seen = z > near - radii
-    for at, focal, size in ((x, camera.K[0, 0], camera.width), (y, camera.K[1, 1], camera.height)):
+    for position, focal, size in ((x, camera.K[0, 0], camera.width), (y, camera.K[1, 1], camera.height)):
         reach = focal * radii / z.clamp(min=near)
-        seen &= (at > -reach) & (at < size + reach)
+        seen &= (position > -reach) & (position < size + reach)
     return bool(seen.any())

@@ -24,7 +24,7 @@ from bitymi_ns.train.views import OnDemand, View
 LIMIT = 2.0  # largest log gain: 7.4 times as bright, about 6 stops in gamma-encoded colours
 OTHER_LIMIT = 0.5  # largest other entry of an affine correction
 EXPLAINED = 0.1
-"""`auto` corrects photographs if gains explain more than this share of their disagreement at the points."""
+"""`auto` corrects photographs if gains explain more than this part of their disagreement at the points."""
 EXIF_SPREAD = 0.03  # without enough points, `auto` corrects photographs if their EXIF gains deviate by this (0.1 stop)
 PRIOR_POINTS = 20  # weight of the EXIF prior (mean exposure if unknown), in points
 BETAS = (0.9, 0.99)  # Adam's betas: a photograph is used once per epoch, so averages must be short
@@ -65,8 +65,8 @@ class Exposure:
         self._learning: list[tuple[int, Tensor]] = []
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
-        """Decide whether to correct photographs, and initialise the corrections. `points`: [M, 3] points of the scene,
-        best those of the capture. `views`: training photographs at full size. `near`: near plane, camera z."""
+        """Decide whether to correct photographs, and initialise the corrections. `points`: [M, 3], best those of the
+        capture. `views`: at full size. `near`: near plane, camera z."""
         self.decided = True
         agreement = estimate_gains(points, views, near)
         prior = self._pooled(exif_gains(self._exif, len(views)), torch.ones(len(views)))
@@ -154,8 +154,7 @@ class Exposure:
 
     @torch.no_grad()
     def step(self, rate: float, processes: Processes = ALONE) -> None:
-        """Update the corrections that `learning` returned by their gradients. `rate`: learning rate of log gains and
-        other entries. `processes`: processes whose views the step averages over."""
+        """Update the corrections that `learning` returned by their gradients, averaged over the processes' views."""
         learning, self._learning = self._learning, []
         if self.table is None or self._moments is None:
             return

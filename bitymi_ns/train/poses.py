@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from bitymi_ns.train.schedules import Schedule
     from bitymi_ns.train.views import View
 
-DAMPING = 0.01  # added to the curvature's diagonal, as a share of it
+DAMPING = 0.01  # added to the curvature's diagonal, relative to it
 NEIGHBOURS = 4  # photographs whose corrections are averaged for another camera
 TRIES = 10  # maximum number of renders to align a view
 FIRST, SHORTEST = 0.7, 0.02  # first step of an alignment and the step length that ends it, pixels
@@ -180,9 +180,8 @@ class Poses:
 
 
 def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
-    """Correct a camera by the weighted mean motion of the nearest photographs, by distance and direction. `camera`: in
-    the frame of the capture. `given`: [V, 4, 4] float64 poses of the photographs in the capture, world to camera.
-    `motions`: [V, 6] float64 corrections of these poses, see `moved`."""
+    """Correct a camera of the capture by the weighted mean motion of the nearest photographs, by distance and
+    direction. `given`, `motions`: [V, 4, 4] float64 poses in the capture, and [V, 6] their corrections (`moved`)."""
     viewmat = camera.viewmat.double().cpu()
     centers = -(given[:, :3, :3] * given[:, :3, 3:]).sum(1)
     reach = (centers - centers.mean(0)).square().sum(1).amax().clamp(min=1e-30)
@@ -219,8 +218,7 @@ def view_psnr(scene: Scene, view: View, background: Tensor | None) -> float:
 @torch.enable_grad()
 def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: float) -> Camera:
     """Align a camera to a fixed scene: minimise the photometric loss against its photograph from the given pose.
-    `view`: on the scene's device, at full size. `background`: [3] colour behind the scene; None: black. `ssim_weight`:
-    SSIM weight of the photometric loss."""
+    `view`: on the scene's device, at full size. `background`: [3] colour behind the scene; None: black."""
 
     def judge(viewmat: Tensor) -> tuple[float, Tensor, Projection]:
         motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)

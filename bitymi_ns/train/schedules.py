@@ -176,7 +176,7 @@ class Schedule:
 
     def resolution_factor(self, step: int) -> float:
         """Compute the factor of the image size, 2^-k; 1 from the last doubling on."""
-        return 2.0 ** -sum(step < at for at in self._doublings)
+        return 2.0 ** -sum(step < doubling for doubling in self._doublings)
 
     def _image_doublings(self, pixels: float) -> list[int]:
         """List the steps from which the image size is doubled, `resolution_schedule` apart.
@@ -207,7 +207,7 @@ class Schedule:
         if name == "means" and not self.in_pixels:
             factor *= self.extent
         elif name in PARAMETERS:
-            factor, name = factor * PARAMETERS[name].share, PARAMETERS[name].rate
+            factor, name = factor * PARAMETERS[name].rate_factor, PARAMETERS[name].rate
         rate = getattr(rates, name)
         if not isinstance(rate, tuple):
             return factor * float(rate)

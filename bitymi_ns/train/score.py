@@ -69,7 +69,7 @@ def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, 
     """Render the views and score every surfel (the score s_d of the paper and FastGS's prune score).
 
     Every fragment that is blended at a bad pixel counts one for its surfel, whatever its weight. `views`: at the
-    resolution to compare at; without views all scores are 0. `processes`: each renders its share of the views."""
+    resolution to compare at, dealt out to the processes; without views all scores are 0."""
     n = len(scene)
     device = scene.surfels["means"].device
     total = torch.zeros(n, dtype=torch.int64, device=device)
@@ -100,7 +100,6 @@ def removal_errors(
     Args:
         views: at the resolution to compare at.
         seed: seed of the signs and of random backgrounds.
-        processes: each renders its share of the views.
 
     Returns:
         Squared change [N] float64, summed over unmasked pixels, channels and views, 0 if no view shows the surfel; and

@@ -133,8 +133,8 @@ class LearningTexels:
             return
         for values in self._parameters:
             if values.grad is not None:
-                share = field.share if values is field.alpha else field.share[:, None]
-                values.addcmul_(share, values.grad, value=-1.0)
+                step_size = field.share if values is field.alpha else field.share[:, None]
+                values.addcmul_(step_size, values.grad, value=-1.0)
                 values.grad = None
                 if values is field.alpha:
                     values.clamp_(0.0, ALPHA_LIMIT)

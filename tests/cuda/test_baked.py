@@ -68,6 +68,22 @@ def check(
     return float((got.rgb.cpu() - want.rgb).abs().max())
 
 
+def check_drawn(
+    scene: BakedScene, photo_pixel: float, device: torch.device, cpu, steps: dict[str, float], furthest: float
+) -> None:
+    """Compare a view of another size with the CPU's: images to `steps` of their largest value, except two pixels in a
+    thousand, and colours to `furthest`."""
+    background = torch.tensor([0.2, 0.4, 0.6])
+    got = draw(scene.to(device), [front()], background.to(device), list(steps), photo_pixel)
+    with cpu():
+        want = draw(scene, [front()], background, list(steps), photo_pixel)
+    for name, step in steps.items():
+        a, b = got[name].cpu().double(), want[name].double()
+        step = step if name in ("rgb", "overdraw") else step * max(1.0, float(b.abs().max()))
+        assert ((a - b).abs() <= step).double().mean() >= 0.998, name
+    assert (got["rgb"].cpu() - want["rgb"]).abs().max() < furthest
+
+
 def test_golden_textured_scene(device: torch.device, cpu) -> None:
     golden = load_golden("textured")
     params = {name: value.float() for name, value in golden.params.items()}
@@ -108,20 +124,11 @@ def test_textures_extents_and_constant_residuals(dtype: torch.dtype, device: tor
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
 def test_alpha_texels(dtype: torch.dtype, photo_pixel: float, device: torch.device, cpu) -> None:
     """The texture unit's weights change sigma, and so what is behind: more than colours."""
-    scene = cut_out(60, 0, dtype)
-    background, names = torch.tensor([0.2, 0.4, 0.6]), ("rgb", "alpha", "beta", "depth", "overdraw")
+    steps = {"rgb": STEP, "alpha": STEP, "beta": STEP, "depth": STEP, "overdraw": 0.5}
     no_constants = {"mean_alpha": None, "mean_residual": None}
-    opaque_texels = {"alpha_scale": 0.0}
-    for changed in ({}, {"weight_bound": 0.0}, opaque_texels, no_constants):
-        of = replace(scene, **changed)
-        got = draw(of.to(device), [front()], background.to(device), names, photo_pixel)
-        with cpu():
-            want = draw(of, [front()], background, names, photo_pixel)
-        for name in names:
-            a, b = got[name].cpu().double(), want[name].double()
-            step = 0.5 if name == "overdraw" else STEP * max(1.0, float(b.abs().max()))
-            assert ((a - b).abs() <= step).double().mean() >= 0.998, (name, changed)
-        assert (got["rgb"].cpu() - want["rgb"]).abs().max() < most(device, 8e-3, 2 * TEXEL + FLIP)
+    for changed in ({}, {"weight_bound": 0.0}, {"alpha_scale": 0.0}, no_constants):
+        scene = replace(cut_out(60, 0, dtype), **changed)
+        check_drawn(scene, photo_pixel, device, cpu, steps, most(device, 8e-3, 2 * TEXEL + FLIP))
 
 
 @pytest.mark.parametrize("alpha, share, least", FAR)
@@ -341,17 +348,8 @@ def test_errors(device: torch.device, cpu) -> None:
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.float32], ids=["uint8", "half"])
 def test_views_of_another_size(photo_pixel: float, dtype: torch.dtype, device: torch.device, cpu) -> None:
     """Widened surfels and texels of their level; half floats round differently."""
-    scene, camera = textured(80, 4, dtype), front()
-    background = torch.tensor([0.2, 0.4, 0.6])
-    names = ("rgb", "alpha", "beta", "depth", "overdraw")
-    got = draw(scene.to(device), [camera], background.to(device), names, photo_pixel)
-    with cpu():
-        want = draw(scene, [camera], background, names, photo_pixel)
-    for name in names:
-        a, b = got[name].cpu().double(), want[name].double()
-        step = STEP if name == "rgb" else 0.5 if name == "overdraw" else 1e-4 * max(1.0, float(b.abs().max()))
-        assert ((a - b).abs() <= step).double().mean() >= 0.998, name
-    assert (got["rgb"].cpu() - want["rgb"]).abs().max() < most(device, 6e-3, 2 * TEXEL + FLIP)
+    steps = {"rgb": STEP, "alpha": 1e-4, "beta": 1e-4, "depth": 1e-4, "overdraw": 0.5}
+    check_drawn(textured(80, 4, dtype), photo_pixel, device, cpu, steps, most(device, 6e-3, 2 * TEXEL + FLIP))
 
 
 def test_a_small_view_has_samples(device: torch.device, cpu) -> None:

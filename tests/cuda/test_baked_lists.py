@@ -11,7 +11,7 @@ from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.cuda.baked_scenes import FLIP, camera_of, front, listed_pairs, most, scene_of
-from tests.ops.golden import crossing_scene, random_scene, reference, tiles_reached
+from tests.ops.golden import SceneCase, crossing_scene, random_scene, reference, tiles_reached
 
 pytestmark = pytest.mark.slow
 
@@ -37,19 +37,25 @@ def lists_of(renderer: BakedRenderer, surfels: int, width: int, height: int, vie
     return lists
 
 
+def check_overdraw(case: SceneCase, device: torch.device, cpu) -> tuple[BakedRenderer, Tensor]:
+    """Compare the overdraw of a case with the CPU's; returns the renderer, and the CPU's."""
+    scene, camera = scene_of(case), camera_of(case)
+    renderer = BakedRenderer(scene.to(device), camera.width, camera.height, images=("overdraw",))
+    got = renderer.draw([camera])["overdraw"].cpu()
+    with cpu():
+        want = scene.render(camera, maps=True).overdraw
+    assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
+    return renderer, want
+
+
 @pytest.mark.parametrize("count", [5, 140])
 def test_large_surfels(count: int, device: torch.device, cpu) -> None:
     """More rows of tiles per surfel, and per block, than the block has threads, among small surfels."""
     case = random_scene(count, 20, width=90, height=360)
     case.params["log_scales"][::2] += 3.0
     case.params["opacity_logits"] -= 4.0  # so that few pixels end before the last surfel
-    scene, camera = scene_of(case), camera_of(case)
-    renderer = BakedRenderer(scene.to(device), camera.width, camera.height, images=("overdraw",))
-    got = renderer.draw([camera])["overdraw"].cpu()
+    renderer, _ = check_overdraw(case, device, cpu)
     assert renderer.workspace.pairs > 30 * count
-    with cpu():
-        want = scene.render(camera, maps=True).overdraw
-    assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -59,11 +65,7 @@ def test_no_pixel_of_thin_small_and_large_surfels_is_lost(seed: int, device: tor
     g = torch.Generator().manual_seed(seed)
     case.params["log_scales"] += 2.0 * torch.randn(150, 2, generator=g, dtype=torch.float64)
     case.params["opacity_logits"] -= 2.0  # so that few pixels end before the last surfel
-    scene, camera = scene_of(case), camera_of(case)
-    got = scene.to(device).render(camera, maps=True).overdraw.cpu()
-    with cpu():
-        want = scene.render(camera, maps=True).overdraw
-    assert ((got != want).double().mean() < 2e-3) and (got - want).abs().max() <= 1
+    check_overdraw(case, device, cpu)
 
 
 @pytest.mark.parametrize("seed, width, height", [(0, 96, 80), (1, 300, 200)])
@@ -72,12 +74,7 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
 ) -> None:
     """Discs without a box are listed only in tiles and parts that they reach, and never beyond the borders."""
     case = crossing_scene(60, seed, width, height)
-    scene, camera = scene_of(case), camera_of(case)
-    renderer = BakedRenderer(scene.to(device), width, height, images=("overdraw",))
-    got = renderer.draw([camera])["overdraw"].cpu()
-    with cpu():
-        want = scene.render(camera, maps=True).overdraw
-    assert ((got[0] != want).double().mean() < 2e-3) and (got[0] - want).abs().max() <= 1
+    renderer, want = check_overdraw(case, device, cpu)
     weights = reference(case, [case.params[name] for name in GEOMETRY]).weight
     assert renderer.workspace.pairs <= 1.25 * int(tiles_reached(weights, width, height).sum())
     assert mask_pixels(renderer, 60, width, height) <= 1.25 * float(want.sum())

@@ -14,6 +14,7 @@ from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
 from tests.cuda.test_texel_training import HERE, START, config, scene_and_views
+from tests.train.part_of_a_run import advanced
 
 pytestmark = pytest.mark.slow
 
@@ -39,9 +40,7 @@ def learned_on() -> Iterator[set[bool]]:
 def trained() -> tuple[Scene, list[View]]:
     """A scene with slightly trained texels (on the CPU), and four photographs."""
     scene, views = scene_and_views()
-    trainer = Trainer(scene, views, config(), 12)
-    for _ in range(START + 3):
-        trainer.advance()
+    trainer = advanced(Trainer(scene, views, config(), 12), START + 3)
     return trainer.scene, [*views, *views]
 
 

@@ -19,6 +19,7 @@ from tests.cuda.conftest import HERE
 from tests.ops.golden import random_scene
 from tests.scene.test_texel_field import make
 from tests.train import part_of_a_run
+from tests.train.part_of_a_run import advanced
 
 STEPS, START = 12, 6
 
@@ -118,8 +119,7 @@ def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) ->
         for state in states:
             resumed = trainer_on(device)
             part_of_a_run.resume(resumed, state)
-            while resumed.step < STEPS:
-                resumed.advance()
+            advanced(resumed, STEPS - resumed.step)
             got = state_of(resumed.scene)
             assert got.keys() == want.keys()
             for name, value in want.items():
@@ -133,9 +133,7 @@ def test_a_run_resumes_before_and_after_its_texels_came(device: torch.device) ->
 
 def test_what_is_left_out_of_a_bake_is_that_of_the_cpu(device: torch.device, cpu) -> None:
     """Tiles and view colours are reduced on the device of the scene."""
-    trainer = trainer_on(device)
-    for _ in range(START + 3):
-        trainer.advance()
+    trainer = advanced(trainer_on(device), START + 3)
     baked, cameras = trained_texels(trainer.scene, BakeOptions(tolerance=4.0)), [v.camera for v in scene_and_views()[1]]
 
     got = prune_and_resample(baked, cameras)

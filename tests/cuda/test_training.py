@@ -13,6 +13,7 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.score import removal_errors
 from bitymi_ns.train.views import View
 from tests.ops.golden import random_scene
+from tests.train.part_of_a_run import advanced
 
 pytestmark = pytest.mark.slow
 
@@ -64,9 +65,7 @@ def motions(device: torch.device) -> torch.Tensor:
     """Return the refined poses' motions after a few steps."""
     scene, views = scene_and_views()
     config = TrainConfig(resolution_schedule=0, refine_poses="on", poses=PoseConfig(start=0))
-    trainer = Trainer(scene.to(device), views, config, STEPS)
-    for _ in range(STEPS):
-        trainer.advance()
+    trainer = advanced(Trainer(scene.to(device), views, config, STEPS), STEPS)
     return trainer.training.poses.motions
 
 

@@ -24,6 +24,7 @@ from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.step import view_losses, with_dropout
 from bitymi_ns.train.views import View
 from tests.ops.golden import SceneCase, random_scene
+from tests.train.part_of_a_run import advanced
 
 pytestmark = pytest.mark.slow
 
@@ -212,12 +213,10 @@ def test_a_run_goes_on_by_lists_and_back(device: torch.device, monkeypatch: pyte
 def test_a_step_makes_few_operations_and_waits_for_the_pairs_alone(exposure: str, device: torch.device) -> None:
     """On a card the host takes 10 to 20 us for each; allocations and views are counted, too."""
     trainer = run(device, exposure=exposure)
-    for _ in range(13):  # creates optimisers' states and tiles
-        trainer.advance()
+    advanced(trainer, 13)  # creates optimisers' states and tiles
     assert isinstance(trainer.scene.field, TexelField)
     with Operations() as counted:
-        for _ in range(5):
-            trainer.advance()
+        advanced(trainer, 5)
     assert counted.count <= 5 * 90
     if device.type == "cuda":
         assert counted.waits == 0  # that for the pairs is the compiled module's; losses arrive later

@@ -39,7 +39,7 @@ def test_an_entry_agrees_with_itself_the_kernels_and_the_twin(kind: str) -> None
     for wrong in {min(entry.counts) - 1, max(entry.counts) + 1}:
         assert entry.problem(wrong)
     for parameter in entry.parameters:
-        assert len(parameter.limit) in (1, parameter.shape[-1]) and 0 < parameter.share <= 1
+        assert len(parameter.limit) in (1, parameter.shape[-1]) and 0 < parameter.rate_factor <= 1
         assert hasattr(LearningRates(), parameter.rate)
     assert len(entry.lean_limit) in (1, entry.lean_width)
     if entry.sites is None:  # the lean colour has the same parameters

@@ -54,6 +54,13 @@ def resume(trainer: Trainer, state: dict[str, Any]) -> None:
     trainer.step = state["step"]
 
 
+def advanced(trainer: Trainer, steps: int) -> Trainer:
+    """Train for some more steps; returns the trainer."""
+    for _ in range(steps):
+        trainer.advance()
+    return trainer
+
+
 def train(inputs: dict[str, Any], processes: Processes) -> dict[str, Any]:
     """Train; returns the final state, and digests of all parameters every ten steps."""
     config, field = SceneConfig(texture=inputs["texture"]), None

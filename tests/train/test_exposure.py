@@ -30,6 +30,7 @@ from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.gains import ExposureGains, estimate_gains
 from bitymi_ns.train.score import multi_view_scores
 from bitymi_ns.train.views import View, shown
+from tests.train.part_of_a_run import advanced
 from tests.train.test_step_sizes import fine
 
 DENSIFY = DensifyConfig(max_surfels=250, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)
@@ -145,16 +146,6 @@ def test_steps_keep_the_mean_and_the_limits(kind: str) -> None:
     assert exposure.table.abs().max() > 0.1
 
 
-def test_a_photograph_that_is_not_shown_keeps_its_moments() -> None:
-    exposure = started("gain", torch.zeros(3, 3))
-    for _ in range(3):
-        learn(exposure, 1).sum().backward()
-        exposure.step(0.01)
-    before = exposure.table.clone()
-    torch.testing.assert_close(before[0], before[2])  # both were moved by the mean only
-    assert bool((before[1] < before[0]).all())
-
-
 # when there are any
 
 
@@ -197,9 +188,7 @@ def test_auto_asks_the_photographs_and_then_exif(monkeypatch, stops, explained, 
 def test_off_and_auto_on_even_photographs_are_the_same_run(make_scene, views) -> None:
     runs = []
     for kind in ("off", "auto"):
-        trainer = Trainer(make_scene(), views, config(kind), 30)
-        for _ in range(30):
-            trainer.advance()
+        trainer = advanced(Trainer(make_scene(), views, config(kind), 30), 30)
         assert trainer.training.exposure.table is None
         runs.append([p.detach().clone() for p in trainer.scene.parameters()])
     for a, b in zip(*runs, strict=True):
@@ -239,9 +228,7 @@ def test_training_learns_the_exposures(make_scene, views, uneven) -> None:
     results, grey = {}, torch.full((1, 1, 3), 0.5)
     for kind in ("off", "gain", "affine"):
         lr = LearningRates(exposure=(0.02, 0.005))
-        trainer = Trainer(make_scene(every=2), uneven, config(kind, lr=lr, resolution_schedule=0), 150)
-        while trainer.step < 150:
-            trainer.advance()
+        trainer = advanced(Trainer(make_scene(every=2), uneven, config(kind, lr=lr, resolution_schedule=0), 150), 150)
         results[kind] = evaluate(trainer.scene, views, trainer.config)
         if kind == "off":
             continue
@@ -319,8 +306,7 @@ def test_going_back_restores_the_corrections(make_scene, uneven) -> None:
     trainer.advance()
     before = trainer.training.exposure.state_dict()["table"]
     trainer.training.guard._states = [(1, trainer.training.guard._capture())]
-    for _ in range(8):
-        trainer.advance()
+    advanced(trainer, 8)
     assert not torch.equal(trainer.training.exposure.table, before)
     with pytest.warns(UserWarning, match="diverged"):
         trainer.training.guard._go_back(9, "a test")

@@ -16,7 +16,7 @@ from bitymi_ns.train.fit import Trainer, fit
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.step import DROPOUT_NUMBERS, view_losses, with_dropout
 from bitymi_ns.train.views import View, at_size, random_numbers
-from tests.train.part_of_a_run import resume, state_of
+from tests.train.part_of_a_run import advanced, resume, state_of
 
 EVERY_EVENT = DensifyConfig(max_surfels=400, min_interval=1, min_reset_interval=1, pixels_per_surfel=0)
 
@@ -65,9 +65,7 @@ def test_the_cap_holds_after_every_step(make_scene, views, cap):
 @pytest.mark.parametrize("options", [{"background": "random"}, {"freeze_every": 1, "exposure": "affine"}])
 def test_a_resumed_run_is_the_same_run(make_scene, views, options):
     config = TrainConfig(densify=replace(EVERY_EVENT, max_surfels=250), **options)
-    straight = Trainer(make_scene(), views, config, 60)
-    for _ in range(14):
-        straight.advance()
+    straight = advanced(Trainer(make_scene(), views, config, 60), 14)
     state = state_of(straight)
     resumed = Trainer(make_scene(every=5), views, config, 60)
     resume(resumed, state)

@@ -20,7 +20,7 @@ from bitymi_ns.train.processes import ALONE
 from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.views import View
 from tests.train.conftest import look_at_origin
-from tests.train.part_of_a_run import resume, state_of
+from tests.train.part_of_a_run import advanced, resume, state_of
 
 QUIET = DensifyConfig(start=30_000, reset_interval=30_000, final_prune_steps=(), prune_error=0.0)
 
@@ -133,9 +133,7 @@ def test_training_finds_the_poses_and_leaves_the_world_where_it_is(ring, ball):
     right, wrong = ring
     found = {}
     for kind in ("off", "on"):
-        trainer = Trainer(scene_of(ball, right), wrong, options(kind), 320)
-        while trainer.step < 320:
-            trainer.advance()
+        trainer = advanced(Trainer(scene_of(ball, right), wrong, options(kind), 320), 320)
         poses = trainer.training.poses
         there = [poses.of(i, view.camera) for i, view in enumerate(wrong)]
         views = [view._replace(camera=camera) for view, camera in zip(wrong, there, strict=True)]
@@ -177,9 +175,7 @@ def test_poses_stay_before_and_after_their_part(make_scene, wrong):
 
 
 def test_a_resumed_run_goes_on_from_the_poses(make_scene, wrong):
-    straight = Trainer(make_scene(texture=False), wrong, options("on"), 60)
-    for _ in range(30):
-        straight.advance()
+    straight = advanced(Trainer(make_scene(texture=False), wrong, options("on"), 60), 30)
     state = state_of(straight)
     resumed = Trainer(make_scene(texture=False, every=5), wrong, options("on"), 60)
     resume(resumed, state)
@@ -206,9 +202,7 @@ def test_poses_of_other_photographs_are_left(cameras):
 
 
 def test_going_back_takes_the_poses_back(make_scene, wrong):
-    trainer = Trainer(make_scene(texture=False), wrong, options("on"), 200)
-    for _ in range(30):
-        trainer.advance()
+    trainer = advanced(Trainer(make_scene(texture=False), wrong, options("on"), 200), 30)
     training = trainer.training
     good = training.guard._states[0][1]["poses"]["motions"]
     training.guard._restore(training.guard._states[0][1])

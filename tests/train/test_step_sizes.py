@@ -17,7 +17,7 @@ from bitymi_ns.train.schedules import Schedule
 from bitymi_ns.train.step_sizes import MEASURED, StepSizes, pixel_footprints
 from bitymi_ns.train.views import View
 from tests.train.conftest import look_at_origin
-from tests.train.part_of_a_run import resume, state_of
+from tests.train.part_of_a_run import advanced
 
 
 def reference(means: Tensor, cameras: list[Camera], near: float) -> Tensor:
@@ -98,8 +98,7 @@ def test_the_scale_of_a_capture_changes_nothing(views: list[View], ball: tuple[T
         config = TrainConfig(resolution_schedule=0)
         here = scaled(views, by)
         trainer = Trainer(scene_for_views(here, xyz * by, rgb, SceneConfig(texture="none"), config), here, config, 60)
-        for _ in range(60):
-            trainer.advance()
+        advanced(trainer, 60)
         losses.append(trainer.loss)
     assert losses[1:] == pytest.approx(losses[:1] * 2, rel=0.05)
 
@@ -149,16 +148,3 @@ def test_rates_in_shares_of_the_extent_are_those_of_the_polish(make_scene, views
     extent = trainer.training.schedule.extent
     assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(4 * 1.6e-4 * extent)
     assert trainer.training.step_sizes.factors() == {} and len(trainer.training.step_sizes.footprints) == 0
-
-
-def test_a_resumed_run_keeps_its_footprints(make_scene, views: list[View]) -> None:
-    trainer = Trainer(make_scene(), views, TrainConfig(), 100)
-    for _ in range(10):
-        trainer.advance()
-    resumed = Trainer(make_scene(every=5), views, TrainConfig(), 100)
-    resume(resumed, state_of(trainer))
-    sizes = trainer.training.step_sizes, resumed.training.step_sizes
-    assert torch.equal(sizes[0].footprints, sizes[1].footprints)
-    for run in (trainer, resumed):
-        run.advance()
-    assert torch.equal(trainer.scene.surfels["means"], resumed.scene.surfels["means"])

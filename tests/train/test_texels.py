@@ -24,7 +24,7 @@ from bitymi_ns.train.texels import (
     tiles_as_seen,
 )
 from bitymi_ns.train.views import at_size
-from tests.train.part_of_a_run import resume, state_of
+from tests.train.part_of_a_run import advanced, resume, state_of
 
 OPTIONS = TexelConfig(start=18_000, pixels_per_texel=0.5)
 
@@ -201,8 +201,7 @@ def test_a_run_resumes_before_and_after_its_texels_came(textured, views) -> None
         resumed = Trainer(textured(every=5), views, config(), 60)
         resume(resumed, state)
         assert isinstance(resumed.scene.field, TexelField) == (resumed.step == 40)
-        while resumed.step < 60:
-            resumed.advance()
+        advanced(resumed, 60 - resumed.step)
         theirs, ours = straight.scene.state_dict(), resumed.scene.state_dict()
         assert theirs.keys() == ours.keys()
         assert all(torch.equal(theirs[name], ours[name]) for name in theirs)
@@ -236,9 +235,7 @@ def test_a_run_of_another_length_goes_on_at_every_event(textured, views, length:
 
 def test_surfels_that_are_pruned_take_their_texels_along(textured, views) -> None:
     scene = textured()
-    trainer = Trainer(scene, views, config(), 60)
-    for _ in range(40):
-        trainer.advance()
+    trainer = advanced(Trainer(scene, views, config(), 60), 40)
     field, n = scene.field, len(scene)
     camera = views[0].camera
     with torch.no_grad():
@@ -257,9 +254,7 @@ def test_surfels_that_are_pruned_take_their_texels_along(textured, views) -> Non
 
 def test_a_run_that_diverges_goes_back_to_its_texels(textured, views) -> None:
     scene = textured()
-    trainer = Trainer(scene, views, config(), 60)
-    for _ in range(45):
-        trainer.advance()
+    trainer = advanced(Trainer(scene, views, config(), 60), 45)
     gone = torch.arange(len(scene)) == 5
     trainer.training.strategy.remove(gone)  # since the state it rolls back to
     with torch.no_grad():

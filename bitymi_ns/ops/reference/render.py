@@ -47,9 +47,9 @@ def texel(tile: Tensor, uv: Tensor, of: Tensor | None = None) -> Tensor:
     low = position.detach().floor().long()
     high = torch.minimum(low + 1, size.long() - 1)
     fu, fv = (position - low)[:, :, None].unbind(1)  # [M, 1]
-    at = () if of is None else (of,)
-    top = tile[(*at, low[:, 1], low[:, 0])] * (1 - fu) + tile[(*at, low[:, 1], high[:, 0])] * fu
-    bottom = tile[(*at, high[:, 1], low[:, 0])] * (1 - fu) + tile[(*at, high[:, 1], high[:, 0])] * fu
+    which = () if of is None else (of,)
+    top = tile[(*which, low[:, 1], low[:, 0])] * (1 - fu) + tile[(*which, low[:, 1], high[:, 0])] * fu
+    bottom = tile[(*which, high[:, 1], low[:, 0])] * (1 - fu) + tile[(*which, high[:, 1], high[:, 0])] * fu
     return top * (1 - fv) + bottom * fv
 
 
@@ -57,10 +57,10 @@ def fetched(tiles: Sequence[Tensor], uv: Tensor, where: Tensor) -> Tensor:
     """Fetch texels [P, N, C] of N tiles [r_v, r_u, C] at coordinates [P, N, 2]; 0 outside the mask `where` [P, N]."""
     values = uv.new_zeros(*where.shape, tiles[0].shape[-1] if tiles else 3)
     for size in {tile.shape for tile in tiles}:  # tiles of one size at once
-        of = torch.tensor([i for i, tile in enumerate(tiles) if tile.shape == size])
-        pixel, row = where[:, of].nonzero(as_tuple=True)
-        found = texel(torch.stack([tiles[i] for i in of.tolist()]), uv[pixel, of[row]], row)
-        values = values.index_put((pixel, of[row]), found)
+        rows = torch.tensor([i for i, tile in enumerate(tiles) if tile.shape == size])
+        pixel, row = where[:, rows].nonzero(as_tuple=True)
+        colors = texel(torch.stack([tiles[i] for i in rows.tolist()]), uv[pixel, rows[row]], row)
+        values = values.index_put((pixel, rows[row]), colors)
     return values
 
 

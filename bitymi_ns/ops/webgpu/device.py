@@ -34,13 +34,13 @@ def device() -> Any:
     """Return the device of this process, a GPU if possible, else a software adapter, with the available `OPTIONAL`.
     Raises WebGpuUnavailable: none found; says what to do."""
     rank = {"DiscreteGPU": 0, "IntegratedGPU": 1, "VirtualGPU": 2, "Unknown": 3, "CPU": 4}
-    found = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
-    if not found:
+    adapters = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
+    if not adapters:
         raise WebGpuUnavailable(
             "no graphics device for WebGPU was found: it needs a driver for Vulkan, Metal or Direct3D 12 (on Debian "
             "and Ubuntu: apt install mesa-vulkan-drivers, which also draws without a GPU)"
         )
-    adapter = min(found, key=lambda a: rank.get(a.info["adapter_type"], 3))
+    adapter = min(adapters, key=lambda a: rank.get(a.info["adapter_type"], 3))
     try:
         return adapter.request_device_sync(
             required_features=[name for name in OPTIONAL if name in adapter.features],
@@ -61,7 +61,7 @@ def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int
     Raises:
         WebGpuUnavailable: a limit is exceeded; says which.
     """
-    found = device().limits
+    limits = device().limits
     wanted = {
         "max-storage-buffer-binding-size": array_bytes,
         "max-buffer-size": array_bytes,
@@ -70,9 +70,9 @@ def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int
         "max-texture-array-layers": layers,
     }
     for name, needed in wanted.items():
-        if needed > found[name]:
+        if needed > limits[name]:
             what = name.removeprefix("max-").replace("-", " ")
-            raise WebGpuUnavailable(f"the graphics device is too small: {what} is {found[name]}, {needed} are needed")
+            raise WebGpuUnavailable(f"the graphics device is too small: {what} is {limits[name]}, {needed} are needed")
 
 
 def in_software() -> bool:

@@ -36,8 +36,8 @@ _STRIDE = 256  # offset alignment of the uniforms of batches and rounds
 @functools.cache
 def programs() -> Programs:
     """Compile the programs for the device of this process."""
-    found = device()
-    return Programs(found, "rgba32float" if "float32-blendable" in found.features else "rgba16float")
+    format = "rgba32float" if "float32-blendable" in device().features else "rgba16float"
+    return Programs(device(), format)
 
 
 @dataclass
@@ -349,12 +349,12 @@ def draw(
         }
         for name, views in drawn.items():
             show, channels = _FROM[name]
-            found = sums[show][..., channels]
+            view = sums[show][..., channels]
             if name == "alpha":
-                found = 1 - found
+                view = 1 - view
             elif name == "overdraw":
-                found = found.round().int()
+                view = view.round().int()
             elif name == "rgb" and background is not None:
-                found = found + sums[show][..., 3:4] * background.detach().float().cpu()
-            views.append(found.contiguous())
+                view = view + sums[show][..., 3:4] * background.detach().float().cpu()
+            views.append(view.contiguous())
     return {name: torch.stack(views) for name, views in drawn.items()}

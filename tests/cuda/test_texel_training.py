@@ -9,7 +9,6 @@ from torch import Tensor
 from bitymi_ns.bake.pipeline import trained_texels
 from bitymi_ns.bake.prune import prune_and_resample
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.ops import Unlisted
 from bitymi_ns.scene import Camera, Scene, SceneConfig
 from bitymi_ns.train.config import DensifyConfig, TexelConfig, TrainConfig
 from bitymi_ns.train.fit import Trainer
@@ -17,29 +16,10 @@ from bitymi_ns.train.texels import blank_texels
 from bitymi_ns.train.views import View
 from tests.cuda.conftest import HERE
 from tests.ops.golden import random_scene
-from tests.scene.test_texel_field import make
 from tests.train import part_of_a_run
 from tests.train.part_of_a_run import advanced
 
 STEPS, START = 12, 6
-
-
-def drawn(device: torch.device, most: int = 0) -> tuple[dict[str, Tensor], int]:
-    """Compute a picture and all gradients, and the number of lists it took."""
-    scene, camera, _ = make(most=most, height=120, width=40)
-    output = scene.to(device).render(camera.to(device))
-    output.rgb.square().sum().backward()
-    found = {name: p.grad for name, p in scene.named_parameters()} | {"rgb": output.rgb.detach()}
-    lists = len(list(output.fragments.lists())) if isinstance(output.fragments, Unlisted) else 1
-    return {name: value.cpu() for name, value in found.items()}, lists
-
-
-@pytest.mark.parametrize("most", [0, 4500])
-def test_a_picture_and_its_gradients_are_those_of_the_cpu(most: int, both) -> None:
-    (got, lists), (want, cpu_lists) = both(lambda where: drawn(where, most))
-    assert got.keys() == want.keys() >= {"field.texels", "surfels.means"} and lists == cpu_lists == (2 if most else 1)
-    for name, value in want.items():
-        assert (got[name] - value).abs().max() <= 1e-9 * value.abs().max(), name
 
 
 def scene_and_views() -> tuple[Scene, list[View]]:

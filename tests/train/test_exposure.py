@@ -301,19 +301,6 @@ def test_states_of_earlier_versions_other_options_and_other_photographs(make_sce
     assert not asked.decided
 
 
-def test_going_back_restores_the_corrections(make_scene, uneven) -> None:
-    trainer = Trainer(make_scene(), uneven, config("gain"), 300)
-    trainer.advance()
-    before = trainer.training.exposure.state_dict()["table"]
-    trainer.training.guard._states = [(1, trainer.training.guard._capture())]
-    advanced(trainer, 8)
-    assert not torch.equal(trainer.training.exposure.table, before)
-    with pytest.warns(UserWarning, match="diverged"):
-        trainer.training.guard._go_back(9, "a test")
-    assert torch.equal(trainer.training.exposure.table, before)
-    trainer.advance()
-
-
 def test_the_photographs_of_a_run_with_its_corrections(make_scene, uneven) -> None:
     trainer = Trainer(make_scene(), uneven, config("gain"), 20)
     trainer.advance()

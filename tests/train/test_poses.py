@@ -201,14 +201,6 @@ def test_poses_of_other_photographs_are_left(cameras):
     assert len(poses.motions) == len(cameras)
 
 
-def test_going_back_takes_the_poses_back(make_scene, wrong):
-    trainer = advanced(Trainer(make_scene(texture=False), wrong, options("on"), 200), 30)
-    training = trainer.training
-    good = training.guard._states[0][1]["poses"]["motions"]
-    training.guard._restore(training.guard._states[0][1])
-    assert torch.equal(training.poses.motions, good)
-
-
 def test_a_step_of_several_views_moves_each(truth, views, wrong):
     schedule = Schedule(replace(options("on"), poses=PoseConfig(start=0)), 60)
     poses, outputs = Poses(schedule, [view.camera for view in wrong]), []

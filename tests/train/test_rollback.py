@@ -2,12 +2,13 @@
 
 import math
 import warnings
+from dataclasses import replace
 
 import pytest
 import torch
 
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, TrainConfig
+from bitymi_ns.train.config import DensifyConfig, GuardConfig, LearningRates, PoseConfig, TrainConfig
 from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.fit import Trainer
@@ -150,6 +151,20 @@ def test_a_few_broken_surfels_are_dropped_and_many_take_the_run_back(begun):
         (report,) = (r for r in (trainer.advance()[2] for _ in range(trainer.training.guard.window)) if "rates" in r)
     assert report["rolled_back"] > 0 and report["rates"] == pytest.approx(0.3) and not describe_broken(scene)
     run(trainer, 5)
+
+
+def test_going_back_restores_exposures_and_poses(begun):
+    config = replace(config_of(), exposure="gain", refine_poses="on", poses=PoseConfig(start=0))
+    trainer = begun(1, of=300, config=config)
+    training, guard = trainer.training, trainer.training.guard
+    before = training.exposure.table.clone(), training.poses.motions.clone()
+    guard._states = [(1, guard._capture())]
+    run(trainer, 8)
+    assert not torch.equal(training.exposure.table, before[0]) and not torch.equal(training.poses.motions, before[1])
+    with pytest.warns(UserWarning, match="diverged"):
+        guard._go_back(9, "a test")
+    assert torch.equal(training.exposure.table, before[0]) and torch.equal(training.poses.motions, before[1])
+    run(trainer, 1)
 
 
 def test_it_does_not_go_back_for_ever(begun):

@@ -100,7 +100,7 @@ def trace(
     hit = crosses & (depth > near)
     uv = torch.where(hit[..., None], uv, 0.0)
     if photo_pixel != 1:
-        shrink, height, radius2, blur_height = _resized(projection, photo_pixel)
+        shrink, peak, radius2, blur_peak = _resized(projection, photo_pixel)
         uv = (shrink @ uv[..., None])[..., 0]
 
     rest = 1 - (uv**2).sum(-1) / SUPPORT**2
@@ -108,7 +108,7 @@ def trace(
     kernel = torch.where(inside, _power(torch.where(inside, rest, 1.0), projection.beta, rim), 0.0)
     blur = torch.exp(-((pixels[:, None] - projection.mean2d[None]) ** 2).sum(-1))
     if photo_pixel != 1:
-        kernel, blur = height * kernel, blur_height * blur ** (1 / radius2)
+        kernel, blur = peak * kernel, blur_peak * blur ** (1 / radius2)
     low_pass = blur > kernel
     sigma = (projection.opacity * torch.where(low_pass, blur, kernel)).clamp(max=ALPHA_MAX)
 

@@ -115,56 +115,57 @@ def color_choices(
     most = entry.terms(surfels) - entry.base_terms
     error = means.new_full((len(means), most + 1), torch.inf)
     largest, choices, done = means.new_zeros(len(means)), [], 0
-    for at in view_directions(means, squares > 0, centers):
-        own = [surfels[name][at.rows] for name in entry.names]
-        shown = squares[:, at.rows].float()
-        unseen, of_unseen = _unseen(means[at.rows], shown, centers, near)
-        weight = torch.cat([_weights(at, shown), of_unseen], dim=1)
-        at = replace(at, unit=torch.cat([at.unit, unseen], dim=1), valid=F.pad(at.valid, (0, unseen.shape[1])))
-        target = shown_at(kind, dict(zip(entry.names, own, strict=True)), at.unit)
+    for chunk in view_directions(means, squares > 0, centers):
+        own = [surfels[name][chunk.rows] for name in entry.names]
+        shown = squares[:, chunk.rows].float()
+        unseen, of_unseen = _unseen(means[chunk.rows], shown, centers, near)
+        weight = torch.cat([_weights(chunk, shown), of_unseen], dim=1)
+        unit, valid = torch.cat([chunk.unit, unseen], dim=1), F.pad(chunk.valid, (0, unseen.shape[1]))
+        chunk = replace(chunk, unit=unit, valid=valid)
+        target = shown_at(kind, dict(zip(entry.names, own, strict=True)), chunk.unit)
 
         def rest_of(rows: Tensor, base: Tensor, terms: Tensor, shown: Tensor) -> Tensor:
             """Record a choice for rows of the chunk; return the rows whose error exceeds the tolerance."""
             away = shown - target[rows]  # noqa: B023 - called in this round alone
             square = (away.square().sum(2) * weight[rows]).sum(1)  # noqa: B023
             bad = beyond("view_base", kind, base).any(1) | beyond("view_terms", kind, terms).flatten(1).any(1)
-            held, of_scene = ~bad & square.isfinite(), at.rows[rows]  # noqa: B023
-            found = opacity[of_scene] * STEPS * (away.abs().amax(2) * at.valid[rows]).amax(1)  # noqa: B023
-            fits = held & (found <= tolerance)
+            held, of_scene = ~bad & square.isfinite(), chunk.rows[rows]  # noqa: B023
+            worst = opacity[of_scene] * STEPS * (away.abs().amax(2) * chunk.valid[rows]).amax(1)  # noqa: B023
+            fits = held & (worst <= tolerance)
             kept = held if len(squares) else fits  # without views nothing is known of the pictures
             error[of_scene, terms.shape[1]] = square.masked_fill(~kept, torch.inf)
-            largest[of_scene] = found
+            largest[of_scene] = worst
             choices.append(tuple(value[kept].cpu() for value in (of_scene, base, terms)))
             return rows[~fits]
 
-        rest = torch.arange(len(at.rows), device=means.device)
-        color = _one_color(target, at.valid, weight, tolerance / opacity[at.rows])
+        rest = torch.arange(len(chunk.rows), device=means.device)
+        color = _one_color(target, chunk.valid, weight, tolerance / opacity[chunk.rows])
         base = (color - COLOR_BIAS) / entry.base_unit
         rest = rest_of(rest, base, base.new_zeros(len(base), 0, entry.lean_width), color[:, None])
         if entry.sites is not None:
             vectors, colors = entry.sites(*own)
-            counts = at.subset(weight, FIT_VIEWS)
-            fit = fewer_sites(at, counts / counts.mean(1, keepdim=True).clamp(min=1e-20), vectors, colors)
+            counts = chunk.subset(weight, FIT_VIEWS)
+            fit = fewer_sites(chunk, counts / counts.mean(1, keepdim=True).clamp(min=1e-20), vectors, colors)
             for number in range(2, vectors.shape[1]):
                 if len(rest):
                     base, terms = fit(number, rest)
                     vectors_of = F.pad(terms[..., :3], (0, 0, 1, 0))
-                    color = site_colors(vectors_of, torch.cat([base[:, None], terms[..., 3:]], dim=1), at.unit[rest])
+                    color = site_colors(vectors_of, torch.cat([base[:, None], terms[..., 3:]], dim=1), chunk.unit[rest])
                     rest = rest_of(rest, base, terms, view_base(color))
             own = colors[:, 0], torch.cat([vectors[:, 1:] - vectors[:, :1], colors[:, 1:]], dim=2)
-        rows = at.rows[rest]
+        rows = chunk.rows[rest]
         error[rows, most], largest[rows] = 0.0, 0.0
         choices.append((rows.cpu(), *(value[rest].cpu() for value in own)))
-        done += len(at.rows)
+        done += len(chunk.rows)
         progress("reducing the view colours", done, len(means))
     return ColorChoices(error.cpu(), largest.cpu(), entry.lean_width, choices)
 
 
-def _weights(at: Directions, weights: Tensor) -> Tensor:
+def _weights(chunk: Directions, weights: Tensor) -> Tensor:
     """Compute the weights [n, D] of the directions from the views' weights [V, n]: `VIEW_SHARE` of a view's
     weight for its own direction, the rest spread evenly over the directions of no view."""
-    of_views = weights.T.gather(1, at.view) * at.valid[:, : at.views]
-    rest = at.valid.shape[1] - at.views
+    of_views = weights.T.gather(1, chunk.view) * chunk.valid[:, : chunk.views]
+    rest = chunk.valid.shape[1] - chunk.views
     between = (1 - VIEW_SHARE) * of_views.sum(1, keepdim=True) / max(1, rest)
     return torch.cat([VIEW_SHARE * of_views, between.expand(-1, rest)], dim=1)
 
@@ -205,11 +206,11 @@ def view_color_errors(
     largest blending weight, in 8-bit steps: [N]. `full`, `lean`: parameters as trained, and lean ones. `seen`: [V, N]
     bool, the training views that see each surfel; V may be 0. `centers`, `opacity`: as in `color_choices`."""
     error = means.new_zeros(len(means))
-    for at in view_directions(means, seen, centers):
-        exact = shown_at(kind, {name: full[name][at.rows] for name in VIEW_COLORS[kind].names}, at.unit)
-        rows = {name: lean[name][at.rows] for name in ("view_base", "view_span")}
-        found = shown_at(kind, {**rows, "view_terms": lean["view_terms"]}, at.unit)
-        error[at.rows] = STEPS * ((exact - found).abs().amax(2) * at.valid).amax(1) * opacity[at.rows]
+    for chunk in view_directions(means, seen, centers):
+        exact = shown_at(kind, {name: full[name][chunk.rows] for name in VIEW_COLORS[kind].names}, chunk.unit)
+        rows = {name: lean[name][chunk.rows] for name in ("view_base", "view_span")}
+        reduced = shown_at(kind, {**rows, "view_terms": lean["view_terms"]}, chunk.unit)
+        error[chunk.rows] = STEPS * ((exact - reduced).abs().amax(2) * chunk.valid).amax(1) * opacity[chunk.rows]
     return error
 
 
@@ -224,8 +225,8 @@ def reduce_view_colors(
     kind, means = kind_of(surfels), surfels["means"]
     opacity, _ = kernel_parameters(surfels, inputs.transmittance)
     squares = means.new_zeros(0, len(means)) if inputs.views is None else inputs.views.squares
-    at = (squares, centers_of(inputs.cameras, means), opacity)
-    choices = color_choices(surfels, kind, *at, tolerance, inputs.near, progress)
+    views = (squares, centers_of(inputs.cameras, means), opacity)
+    choices = color_choices(surfels, kind, *views, tolerance, inputs.near, progress)
     lean, entry = choices.at(), VIEW_COLORS[kind]
     before = sum(each[0].numel() for each in entry.of(surfels)) if len(means) else 0
     sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a lean colour, and its terms
@@ -256,14 +257,14 @@ def site_colors(vectors: Tensor, rgb: Tensor, directions: Tensor) -> Tensor:
 
 
 def fewer_sites(
-    at: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
+    chunk: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
 ) -> Callable[[int, Tensor], tuple[Tensor, Tensor]]:
     """Rank the sites by how much they are needed, and return a fit of the first ones to the colour of all, by
     Levenberg-Marquardt: a function of a number of sites below K, and of rows, to base [m, 3] and terms [m, number - 1,
     6]. `weight`: [n, D'] of the directions that `Directions.subset` selects. `vectors`, `rgb`: [n, K, 3] of all
     sites."""
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
-    unit = torch.cat([at.subset(at.unit, FIT_VIEWS), outside], dim=1)
+    unit = torch.cat([chunk.subset(chunk.unit, FIT_VIEWS), outside], dim=1)
     weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)
     cpu, order = backend.load("_cpu"), torch.empty(vectors.shape[:2], dtype=torch.int64)  # whatever the device is
     given = {"vectors": vectors.cpu().contiguous(), "colors": rgb.cpu().contiguous(), "order": order}
@@ -275,10 +276,10 @@ def fewer_sites(
     def fit(number: int, rows: Tensor) -> tuple[Tensor, Tensor]:
         kept = order[rows, :number, None].expand(-1, -1, 3)
         v, r = vectors[rows].gather(1, kept), rgb[rows].gather(1, kept)
-        found = {"vectors": (v[:, 1:] - v[:, :1]).cpu().contiguous(), "colors": r.cpu()}
+        sites = {"vectors": (v[:, 1:] - v[:, :1]).cpu().contiguous(), "colors": r.cpu()}
         counts = {"sites": number, "directions": samples.shape[1], "rounds": FIT_STEPS}
-        cpu.fit_sites_f32(**found, **counts, samples=samples[rows].cpu())
-        v, r = (value.to(rgb.device) for value in found.values())
+        cpu.fit_sites_f32(**sites, **counts, samples=samples[rows].cpu())
+        v, r = (value.to(rgb.device) for value in sites.values())
         return r[:, 0], torch.cat([v, r[:, 1:]], dim=2)
 
     return fit

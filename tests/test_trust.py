@@ -21,7 +21,7 @@ from bitymi_ns.files import reason
 from bitymi_ns.measure.bench.cells import Cells
 from bitymi_ns.measure.bench.process import BenchError, run_measured
 from bitymi_ns.plugin.run.callbacks import TrainingCurve
-from bitymi_ns.plugin.run.run_folder import keep_poses_report
+from bitymi_ns.plugin.run.folder_lock import keep_poses_report
 from bitymi_ns.trust import (
     Refused,
     check_replaceable,

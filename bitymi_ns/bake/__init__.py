@@ -1,6 +1,6 @@
 """Trained scene to bundle contents: tiles, view colours, fine-tuning, coding; `field`: of the paper's field."""
 
-from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
+from bitymi_ns.bake.field.train_texels import PolishOptions, polish_scene
 from bitymi_ns.bake.pipeline import RefineOptions, bake, bake_field
 from bitymi_ns.bake.prune import prune_and_resample
 from bitymi_ns.bake.stages import Coded, Reduced, Rounded, Stage, Trained, export

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.bake.compact import Compact, compacted
-from bitymi_ns.bake.field.polish import PolishOptions, polish_scene
 from bitymi_ns.bake.field.tiles import field_tiles
+from bitymi_ns.bake.field.train_texels import PolishOptions, polish_scene
 from bitymi_ns.bake.prune import drawable, prune_and_resample
 from bitymi_ns.bake.stages import BakeableScene, Coded, Trained, laid_out
 from bitymi_ns.bake.tile_errors import certified

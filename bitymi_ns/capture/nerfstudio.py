@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.report import FILES
+from bitymi_ns.capture.sfm_report import FILES
 from bitymi_ns.capture.transforms import INTRINSICS
 from bitymi_ns.capture.types import FoundPoses
 from bitymi_ns.files import complete_folder, copy_files

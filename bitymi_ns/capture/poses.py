@@ -21,11 +21,11 @@ from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
 from bitymi_ns.capture.kinds import FILM, VIDEOS
 from bitymi_ns.capture.masks import find_masks, mask_folder, write_colmap_masks
 from bitymi_ns.capture.recognise import is_model
-from bitymi_ns.capture.report import write_report
 from bitymi_ns.capture.sfm import process
-from bitymi_ns.capture.sfm.explain import SHOOT
 from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
+from bitymi_ns.capture.sfm.model_checks import SHOOT
 from bitymi_ns.capture.sfm_photos import Photo
+from bitymi_ns.capture.sfm_report import write_report
 from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, FoundPoses, SfmOptions, fail, is_full_sphere
 from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file

@@ -19,7 +19,7 @@ from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, read_image
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.order import natural
-from bitymi_ns.capture.sfm.explain import rays_meet
+from bitymi_ns.capture.sfm.model_checks import rays_meet
 from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, CaptureError, ColmapCamera, Photograph, fail, warn
 from bitymi_ns.ranges import spread
 from bitymi_ns.trust import listed, told_apart

@@ -79,8 +79,6 @@ template <class S> void bind_operations(nb::module_& m) {
   bind_operation(m, name("trace_fill"), &trace_fill<S>);
   bind_operation(m, name("rasterize_forward"), &rasterize_forward<S>);
   bind_operation(m, name("rasterize_backward"), &rasterize_backward<S>);
-  bind_operation(m, name("picture_loss"), &picture_loss<S>);
-  bind_operation(m, name("picture_loss_backward"), &picture_loss_backward<S>);
   bind_operation(m, name("accumulate_statistics"), &accumulate_statistics<S>);
   bind_adam<S>(m, name("adam"));
   bind_training_view<S>(m);
@@ -88,7 +86,6 @@ template <class S> void bind_operations(nb::module_& m) {
   m.def(name("bin_count_workspace").c_str(), &bin_count_workspace<S>, "n"_a);
   m.def(name("bin_fill_workspace").c_str(), &bin_fill_workspace, "pairs"_a, "width"_a, "height"_a);
   m.def(name("trace_mark_workspace").c_str(), &trace_mark_workspace, "pairs"_a);
-  m.def(name("picture_loss_workspace").c_str(), &picture_workspace<S>, "height"_a, "width"_a);
   m.def(name("ssim_workspace").c_str(), &ssim_workspace<S>, "height"_a, "width"_a, "channels"_a, "gradient"_a);
 }
 

@@ -249,27 +249,27 @@ template <class S> int64_t picture_workspace(int height, int width) {
   return space_bytes<PictureSpace<S>>(height, width);
 }
 
-template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream) {
-  const Picture<S>& p = a.picture;
+template <class S> void picture_loss(const Picture<S>& p, S* photometric, S* falloff, Stream stream) {
   const PictureSpace<S> space = picture_space(p);
   BT_LAUNCH_EACH(show_kernel<S>, p.pixels(), kThreads, stream, p, space);
   ssim(Ssim<S>{p.height, p.width, 3, space.shown, space.wanted, space.similarity, space.dsimilarity, space.ssim},
        stream);
   const int blocks = sum_blocks(p.pixels());
   if (blocks) BT_LAUNCH(sums_kernel<S>, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, p, space);
-  BT_LAUNCH(loss_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, p, space, a.photometric, a.falloff);
+  BT_LAUNCH(loss_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, p, space, photometric, falloff);
 }
 
-template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream) {
-  const Picture<S>& p = a.picture;
+template <class S>
+void picture_loss_backward(const Picture<S>& p, const S* dphotometric, const S* dfalloff, S* dimage, S* dcorrection,
+                           Stream stream) {
   const PictureSpace<S> space = picture_space(p);
   const int blocks = sum_blocks(p.pixels());
   const auto run = p.corrected ? gradient_kernel<S, true> : gradient_kernel<S, false>;
   if (blocks)
-    BT_LAUNCH(run, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, p, space, a.dphotometric, a.dfalloff, a.dimage);
-  if (a.dcorrection)
+    BT_LAUNCH(run, dim3(unsigned(blocks)), dim3(kThreads), 0, stream, p, space, dphotometric, dfalloff, dimage);
+  if (dcorrection)
     BT_LAUNCH(correction_kernel<S>, dim3(1), dim3(kThreads), 0, stream, blocks, p.corrected, space.correction_sums,
-              a.dcorrection);
+              dcorrection);
 }
 
 template <class S> void accumulate_statistics(const DensifyStatistics<S>& a, Stream stream) {
@@ -299,8 +299,10 @@ template int64_t picture_workspace<double>(int, int);
 BT_INSTANTIATE(learn_exposure, LearnExposure)
 template void adam(const AdamParameter<float>*, int, Stream);
 template void adam(const AdamParameter<double>*, int, Stream);
-BT_INSTANTIATE(picture_loss, PictureLoss)
-BT_INSTANTIATE(picture_loss_backward, PictureLossBackward)
+template void picture_loss(const Picture<float>&, float*, float*, Stream);
+template void picture_loss(const Picture<double>&, double*, double*, Stream);
+template void picture_loss_backward(const Picture<float>&, const float*, const float*, float*, float*, Stream);
+template void picture_loss_backward(const Picture<double>&, const double*, const double*, double*, double*, Stream);
 BT_INSTANTIATE(accumulate_statistics, DensifyStatistics)
 
 }  // namespace bt::cuda

@@ -22,11 +22,6 @@ template <class S> struct Picture {
   Workspace workspace;
 
   BT_HD int64_t pixels() const { return int64_t(height) * width; }
-  template <class R> void fields(R& r) {
-    r.array("image", image, pixels() * kImageChannels);
-    compared(r);
-    r.memory("picture_work", workspace);
-  }
   // All but the image and working memory.
   template <class R> void compared(R& r) {
     r.array("target", target, 3 * pixels());
@@ -43,33 +38,12 @@ template <class S> int64_t picture_workspace(int height, int width);
 
 // Writes photometric = (1 - ssim_weight) l1 + ssim_weight (1 - SSIM) and falloff = falloff_weight times `right` above;
 // [1] each.
-template <class S> struct PictureLoss {
-  Picture<S> picture;
-  S *photometric, *falloff;
-
-  template <class R> void fields(R& r) {
-    r.numbers("height", picture.height, "width", picture.width);
-    picture.fields(r);
-    r.arrays(1, "photometric", photometric, "falloff", falloff);
-  }
-};
-template <class S> void picture_loss(const PictureLoss<S>& a, Stream stream);
+template <class S> void picture_loss(const Picture<S>& p, S* photometric, S* falloff, Stream stream);
 
 // Writes dimage, and dcorrection unless null, from the gradients of both losses [1]; omega is a constant.
-template <class S> struct PictureLossBackward {
-  Picture<S> picture;
-  const S *dphotometric, *dfalloff;
-  S *dimage, *dcorrection;
-
-  template <class R> void fields(R& r) {
-    r.numbers("height", picture.height, "width", picture.width);
-    picture.fields(r);
-    r.arrays(1, "dphotometric", dphotometric, "dfalloff", dfalloff);
-    r.array("dimage", dimage, picture.pixels() * kImageChannels);
-    r.maybe("dcorrection", dcorrection, picture.corrected);
-  }
-};
-template <class S> void picture_loss_backward(const PictureLossBackward<S>& a, Stream stream);
+template <class S>
+void picture_loss_backward(const Picture<S>& p, const S* dphotometric, const S* dfalloff, S* dimage, S* dcorrection,
+                           Stream stream);
 
 // Updates the densification statistics [n] with a view, see `train.strategy.Strategy.accumulate`. grad and absgrad [n,
 // 2] are null if nothing was visible.

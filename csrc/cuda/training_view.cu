@@ -107,15 +107,14 @@ template <class S> void draw_view(const DrawView<S>& a, Stream stream) {
   bin_fill(BinFill<S>{s.view(), s.of.order, s.of.slot_start, a.pairs, p.slot, p.surfel, p.tile_pairs, p.fill}, stream);
   const MarkedView<S> marked = {s.view(), s.v.alpha, a.pairs, p.surfel, p.tile_pairs, p.masks, p.cuts};
   rasterize_forward(RasterizeForward<S>{marked, s.v.table, s.v.bound, s.of.image, s.of.transmittance}, stream);
-  picture_loss(PictureLoss<S>{s.v.picture, s.v.photometric, s.v.falloff}, stream);
+  picture_loss(s.v.picture, s.v.photometric, s.v.falloff, stream);
 }
 
 template <class S> void differentiate_view(const DifferentiateView<S>& a, Stream stream) {
   const Spaces<S> s(*a.drawn.view);
   const PairSpace<S> p = s.pairs(a.drawn);
   const TrainingView<S>& v = s.v;
-  picture_loss_backward(PictureLossBackward<S>{v.picture, a.dphotometric, a.dfalloff, s.of.dimage, a.dcorrection},
-                        stream);
+  picture_loss_backward(v.picture, a.dphotometric, a.dfalloff, s.of.dimage, a.dcorrection, stream);
   const Pairs layout = {v.width, v.height, v.surfels.n,  a.drawn.pairs, p.surfel,        p.slot,
                         p.masks, nullptr,  p.tile_pairs, s.of.order,    s.of.slot_start, -1};
   const RasterizeBackward<S> gradients = {

@@ -19,8 +19,8 @@ from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.capture.types import SfmSettings
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.trained import load_trained, world_of
-from bitymi_ns.plugin.run import run_folder
-from bitymi_ns.plugin.run.run_folder import POSES
+from bitymi_ns.plugin.run import folder_lock
+from bitymi_ns.plugin.run.folder_lock import POSES
 from tests.captures import colmap_model, found_poses, printed
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
@@ -148,7 +148,7 @@ def test_poses_not_kept_do_not_stop_the_run(shoot: Callable[..., Shot], monkeypa
     def full(*arguments: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(run_folder, "write_kept_poses", full)
+    monkeypatch.setattr(folder_lock, "write_kept_poses", full)
     shot = shoot()
     assert checkpoint(shot.config, STEPS - 1)["step"] == STEPS - 1 and not (shot.run / POSES).exists()
     assert "the disk is full" in (text := printed(capsys)) and "Nor are the poses: leave the photographs" in text

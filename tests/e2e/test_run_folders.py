@@ -15,7 +15,7 @@ from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.plugin.console import InputError
-from bitymi_ns.plugin.run import run_folder
+from bitymi_ns.plugin.run import folder_lock
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from tests.e2e.runs import Start, checkpoint
 
@@ -41,9 +41,9 @@ def test_a_full_disk_keeps_the_earlier_checkpoint(start: Start, monkeypatch: pyt
 HOLDS = """
 import sys
 from pathlib import Path
-from bitymi_ns.plugin.run import run_folder
+from bitymi_ns.plugin.run import folder_lock
 
-run_folder.take(Path(sys.argv[1]))
+folder_lock.take(Path(sys.argv[1]))
 print("has it", flush=True)
 sys.stdin.read()
 """
@@ -76,7 +76,7 @@ def test_a_folder_takes_one_run_at_a_time(start: Start) -> None:
 
 
 def test_too_little_room_for_a_checkpoint_is_found_first(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run_folder.files, "free_bytes", lambda path: 12_000)
+    monkeypatch.setattr(folder_lock.files, "free_bytes", lambda path: 12_000)
     config = start(name="full")
     with pytest.raises(InputError, match=r"has 12.0 kB free, and a checkpoint takes [\d.]+ [kM]B already at the start"):
         ns_train.main(config)

@@ -30,13 +30,13 @@ from nerfstudio.scripts.eval import ComputePSNR
 from bitymi_ns import cli, exit_messages
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.capture.nerfstudio import write_capture
-from bitymi_ns.capture.report import FILES
+from bitymi_ns.capture.sfm_report import FILES
 from bitymi_ns.capture.types import FoundPoses
 from bitymi_ns.files import complete_folder, write_errors_as
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.export.mesh import ExportMesh
-from bitymi_ns.plugin.run import checkpoints, run_folder
+from bitymi_ns.plugin.run import checkpoints, folder_lock
 from bitymi_ns.plugin.run.callbacks import TrainingCurve
 from bitymi_ns.sample import capture as sample_capture
 from bitymi_ns.sample import generate
@@ -230,7 +230,7 @@ def writers(work: Path) -> dict[str, Callable[[Path, int], Any]]:
         try:
             begun.save_config()
         finally:
-            run_folder.leave(begun.get_base_dir())
+            folder_lock.leave(begun.get_base_dir())
 
     report = work / "psnr.json"
     ComputePSNR(load_config=run, output_path=report).main()

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.sfm import explain, pairs
-from bitymi_ns.capture.sfm.explain import contradicted, drop_unlinked
+from bitymi_ns.capture.sfm import matching, model_checks
 from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
+from bitymi_ns.capture.sfm.model_checks import contradicted, drop_unlinked
 from bitymi_ns.capture.types import CONTRADICTED
 
 Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
@@ -134,8 +134,8 @@ def _filter(model: pycolmap.Reconstruction, pixel: float) -> None:
 def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
     """Triangulate points with a job's known poses. Raises NoPoses: hardly any, so the poses may be wrong."""
     database = Path(job.work) / DATABASE
-    pairs.extract(job, database, tell)
-    pairs.match(job, database, tell)
+    matching.extract(job, database, tell)
+    matching.match(job, database, tell)
     tell("triangulating", 0, 1)
     model = _known(job, database)
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=job.threads)
@@ -147,7 +147,7 @@ def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
         model = pycolmap.triangulate_points(model, database, job.images, scratch, options=options)
     tell("triangulating", 1, 1)
     if model.num_points3D() < LEAST_POINTS:
-        matches = sum(explain.view_graph(database).inliers.values())
+        matches = sum(model_checks.view_graph(database).inliers.values())
         why = "the poses may belong to other photographs, or have another convention"
         if matches < TELLING:
             why = f"the photographs share hardly any detail, {matches} matches in all"

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap  # in this process with its signal handlers, which write the stack of a crash to the log
 
 from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.sfm import explain, mapping, pairs
+from bitymi_ns.capture.sfm import mapping, matching, model_checks
 from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder, write_errors_as
 
@@ -47,20 +47,20 @@ def send(**line: object) -> None:
 def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, object]]:
     """Find poses of a job's photographs; return the model and statistics. Raises NoPoses: there are none."""
     database = Path(job.work) / DATABASE
-    pairs.extract(job, database, stages)
-    pairs.match(job, database, stages)
+    matching.extract(job, database, stages)
+    matching.match(job, database, stages)
     graph, model = _mapped(job, database, stages)
     registered = model.num_reg_images() if model is not None else 0
-    chosen = pairs.FEW < len(job.order) <= pairs.WORTH_ALL and job.matching == "auto"
+    chosen = matching.FEW < len(job.order) <= matching.WORTH_ALL and job.matching == "auto"
     if chosen and registered < mapping.ENOUGH * len(job.order):
-        pairs.match(job, database, stages, every=True)
+        matching.match(job, database, stages, every=True)
         graph, again = _mapped(job, database, stages)
         model = mapping.better(job, database, model, again)
     if model is None or model.num_reg_images() < LEAST:
-        raise explain.why_none(job, graph)
-    angle = explain.parallax(model)
-    if angle < explain.PARALLAX:
-        raise NoPoses(explain.FROM_ONE_SPOT)
+        raise model_checks.why_none(job, graph)
+    angle = model_checks.parallax(model)
+    if angle < model_checks.PARALLAX:
+        raise NoPoses(model_checks.FROM_ONE_SPOT)
     placed = {image.name for image in model.images.values() if image.has_pose}
     model.extract_colors_for_all_images(job.images)
     return model, {
@@ -69,17 +69,17 @@ def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, o
         "track_length": model.compute_mean_track_length(),
         "points": model.num_points3D(),
         "parallax_degrees": angle,
-        "contradicted": explain.contradicted(model, database, job.pixel),
+        "contradicted": model_checks.contradicted(model, database, job.pixel),
         "pairs": len(graph.inliers),
-        "left_out": explain.left_out(graph, placed, job.names),
+        "left_out": model_checks.left_out(graph, placed, job.names),
     }
 
 
-def _mapped(job: Job, database: Path, stages: Stages) -> tuple[explain.ViewGraph, pycolmap.Reconstruction | None]:
-    graph = explain.view_graph(database)
+def _mapped(job: Job, database: Path, stages: Stages) -> tuple[model_checks.ViewGraph, pycolmap.Reconstruction | None]:
+    graph = model_checks.view_graph(database)
     parts = graph.components()
-    if explain.only_turned(job, database):
-        raise NoPoses(explain.FROM_ONE_SPOT)
+    if model_checks.only_turned(job, database):
+        raise NoPoses(model_checks.FROM_ONE_SPOT)
     if not parts or len(parts[0]) < LEAST:
         return graph, None
     return graph, mapping.reconstruct(job, database, len(parts[0]), stages)

@@ -26,7 +26,7 @@ from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
 from bitymi_ns.plugin.data.capture_checks import check_capture, read_early
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
+from bitymi_ns.plugin.run import checkpoints, folder_lock, torchrun
 from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
 from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
 from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
@@ -146,8 +146,8 @@ class BitymiTrainerConfig(TrainerConfig):
             recorded.pipeline.datamanager.dataparser.poses_as = capture.poses_as
         folder = self.get_base_dir()
         if self.load_dir is None and self.load_checkpoint is None:
-            run_folder.check_unused(folder, self.get_checkpoint_dir())
-        run_folder.take(folder)
+            folder_lock.check_unused(folder, self.get_checkpoint_dir())
+        folder_lock.take(folder)
         with write_errors_as(folder, InputError, " (--output-dir)."):
             write_file(folder / "config.yml", yaml.dump(recorded).encode("utf8"))
         # what follows in nerfstudio would start the processes its own way, see `torchrun`
@@ -218,8 +218,8 @@ class BitymiTrainerConfig(TrainerConfig):
     def take_poses_of(self, run: Path) -> None:
         """Make the dataparser read poses kept in the folder `run`, if any."""
         dataparser = self.pipeline.datamanager.dataparser
-        if isinstance(dataparser, BitymiDataParserConfig) and has_kept_poses(run / run_folder.POSES):
-            dataparser.poses = run / run_folder.POSES
+        if isinstance(dataparser, BitymiDataParserConfig) and has_kept_poses(run / folder_lock.POSES):
+            dataparser.poses = run / folder_lock.POSES
 
     def is_viewer_enabled(self) -> bool:
         return self.vis != "none" and super().is_viewer_enabled()

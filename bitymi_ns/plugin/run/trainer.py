@@ -27,7 +27,7 @@ from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.hooks import print_brackets
-from bitymi_ns.plugin.run import checkpoints, run_folder, torchrun
+from bitymi_ns.plugin.run import checkpoints, folder_lock, torchrun
 from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
 from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.safe_reading import reading
@@ -89,7 +89,7 @@ class BitymiTrainer(Trainer):
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
             raise SystemExit(INTERRUPTED) from None
         facts = self.pipeline.datamanager.train_dataset.facts
-        run_folder.keep_poses_report(self.base_dir, facts.poses_report, facts.poses_found)
+        folder_lock.keep_poses_report(self.base_dir, facts.poses_report, facts.poses_found)
         for line in getattr(self.viewer_state, "viewer_info", []):
             CONSOLE.print(line, soft_wrap=True)
         # last callback of a step: the complete state can be saved
@@ -144,7 +144,7 @@ class BitymiTrainer(Trainer):
             # a GPU that waits for a lost process would block this: it is freed when this process ends
             if dist.is_initialized() and (orderly or self.config.machine.device_type != "cuda"):
                 dist.destroy_process_group()
-            run_folder.leave(self.base_dir)
+            folder_lock.leave(self.base_dir)
 
     def _train_to_the_end(self) -> None:
         total = self.config.max_num_iterations
@@ -154,7 +154,7 @@ class BitymiTrainer(Trainer):
             return
         if self.processes.first:  # of every parameter a checkpoint holds the value and Adam's two moments
             learned = [p.nbytes for p in self.pipeline.parameters() if p.requires_grad]
-            run_folder.check_space(self.base_dir, 3 * sum(learned))
+            folder_lock.check_space(self.base_dir, 3 * sum(learned))
         if self._start_step > 0:
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
         previous = self._catch_interrupt()

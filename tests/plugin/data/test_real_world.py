@@ -14,7 +14,7 @@ from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.export.trained import world_of
-from bitymi_ns.plugin.run.run_folder import keep_poses_report
+from bitymi_ns.plugin.run.folder_lock import keep_poses_report
 from tests.bake.conftest import surfels
 from tests.bake.scenes import write
 from tests.captures import colmap_model, found_poses, images_of, load_any

@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from bitymi_ns.capture.sfm.explain import contradicted, drop_unlinked
+from bitymi_ns.capture.sfm.model_checks import contradicted, drop_unlinked
 
 
 @pytest.fixture

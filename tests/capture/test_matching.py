@@ -7,10 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from bitymi_ns.capture.sfm import pairs
-from bitymi_ns.capture.sfm.explain import ViewGraph, left_out
+from bitymi_ns.capture.sfm import matching
 from bitymi_ns.capture.sfm.job import CameraGroup, Job
-from bitymi_ns.capture.sfm.pairs import NEIGHBOURS, is_sequence, nearest_neighbours, sequence
+from bitymi_ns.capture.sfm.matching import NEIGHBOURS, is_sequence, nearest_neighbours, sequence
+from bitymi_ns.capture.sfm.model_checks import ViewGraph, left_out
 from bitymi_ns.capture.types import ColmapCamera
 
 
@@ -65,12 +65,12 @@ def job_of(places: dict[str, list[float]], order: list[str]) -> Job:
 
 def test_photographs_are_compared_with_those_near_them(monkeypatch: pytest.MonkeyPatch) -> None:
     count = 60
-    monkeypatch.setattr(pairs, "likeness", lambda job, database, tell: np.zeros((count, count), np.float32))
+    monkeypatch.setattr(matching, "likeness", lambda job, database, tell: np.zeros((count, count), np.float32))
     order = [f"{i}" for i in np.random.default_rng(0).permutation(count)]
     line = {name: [10.0 * int(name), 0.0, 0.0] for name in order}
 
     def chosen(places: dict[str, list[float]]) -> set[tuple[int, int]]:
-        found = pairs.choose(job_of(places, order), Path(), lambda *said: None)
+        found = matching.choose(job_of(places, order), Path(), lambda *said: None)
         return {(int(order[i]), int(order[j])) for i, j in found}
 
     alone = chosen({})
@@ -98,7 +98,7 @@ def test_a_run_that_was_killed_between_its_cameras_goes_on(two_cameras: Job, tmp
     with pycolmap.Database.open(database) as opened:
         opened.write_camera(two_cameras.cameras[0].camera.colmap)
     for _ in range(2):
-        pairs.extract(two_cameras, database, lambda *told, **more: None)
+        matching.extract(two_cameras, database, lambda *told, **more: None)
     with pycolmap.Database.open(database) as opened:
         assert [camera.params[0] for camera in opened.read_all_cameras()] == [90.0, 91.0]
         images = opened.read_all_images()

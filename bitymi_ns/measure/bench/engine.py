@@ -115,13 +115,13 @@ def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
             continue
         broken: list[Cell] = []
         path = work / "locks" / f"{chain[0].folder.replace('/', '--')}.lock"
-        try:
-            with write_errors_as(work, BenchError, ", with --work"):
-                path.parent.mkdir(parents=True, exist_ok=True)
+        with write_errors_as(work, BenchError, ", with --work"):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
                 lock = Lock(path, say)
-        except Busy as error:
-            failures.append(f"{chain[0].run}: {error}")
-            continue
+            except Busy as error:
+                failures.append(f"{chain[0].run}: {error}")
+                continue
         with lock:
             cells.refresh()
             for cell in missing(chain, cells):

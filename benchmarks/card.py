@@ -73,13 +73,14 @@ def stage(arguments: argparse.Namespace) -> None:
     """Collect the wheels and LPIPS's weights and archive them in parts, see above."""
     kept = ROOT / "build" / f"card-{Path(arguments.python).name}"
     tools, wheels = kept / "tools", kept / "wheels"
-    wheels.mkdir(parents=True, exist_ok=True)
+    if arguments.folder.exists():
+        sys.exit(f"{arguments.folder} exists: name a new folder, or remove it")
+    shutil.rmtree(wheels, ignore_errors=True)  # of other versions
+    wheels.mkdir(parents=True)
     if not tools.exists():
         subprocess.run([arguments.python, "-m", "venv", str(tools)], check=True)
         subprocess.run([tools / "bin/python", "-m", "pip", "install", "-q", *TOOLS], check=True)
     pip = [str(tools / "bin/python"), "-m", "pip", "--disable-pip-version-check"]
-    for old in wheels.glob("bitymi_ns-*.whl"):
-        old.unlink()
     architectures = f"cmake.define.BITYMI_CUDA_ARCHITECTURES={arguments.architectures}"
     settings = ("cmake.define.BITYMI_CUDA=ON", architectures, f"build-dir={kept / 'build'}")
     options = [f"--config-settings={setting}" for setting in settings]

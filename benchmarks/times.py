@@ -296,7 +296,7 @@ def cuda(
     sections: tuple[Section, ...] = tuple(SECTIONS),
     times: int = 0,
 ) -> None:
-    """Run each CUDA kernel once on a small scene, for sanitizers, or print its device time.
+    """Run the CUDA kernels of the sections once on a small scene, for sanitizers, or print their device times.
 
     Args:
         surfels: Size of the scene.

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from .backend import cuda_backend
+from .backend import cuda_backend, on_same_device
 from .capacity import TooManyFragments
 from .constants import TILE
+from .fragment_list import Layout
 from .project import Projection
-from .trace import Fragments, trace
+from .trace import Fragments, count_masked, trace
 
 T = TypeVar("T")
 
@@ -31,9 +32,12 @@ class Unlisted:
     projection: Projection
     rim: float  # as in `trace`
     most: int = 0  # largest number of fragments of a list, likewise
+    layout: Layout | None = None  # pairs and masks of a view drawn without a list, which suffice for counts by surfel
 
     def __len__(self) -> int:
-        return sum(len(fragments) for fragments in self.lists())
+        camera = self.projection.camera
+        every = torch.ones(camera.width * camera.height, dtype=torch.bool, device=self.projection.geom.device)
+        return int(self.masked_counts(every).sum())
 
     def lists(self) -> Iterator[Fragments]:
         """Yield lists of the fragments from top to bottom."""
@@ -45,8 +49,15 @@ class Unlisted:
 
     def masked_counts(self, mask: Tensor) -> Tensor:
         """Count the fragments of each surfel on masked pixels; see `Fragments.masked_counts`."""
-        counts = torch.zeros(len(self.projection.geom), dtype=torch.int32, device=mask.device)
-        rows, top = mask.view(self.projection.camera.height, -1), 0
+        camera, n = self.projection.camera, len(self.projection.geom)
+        on_same_device(self.projection.geom, mask=mask)
+        if mask.numel() != camera.width * camera.height:
+            raise ValueError(f"the mask has {mask.numel()} pixels, the view {camera.width * camera.height}")
+        if self.layout is not None:
+            view = {"layout": self.layout.handle, "width": camera.width, "height": camera.height}
+            return count_masked(view, mask, n)
+        counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
+        rows, top = mask.view(camera.height, -1), 0
         for fragments in self.lists():
             counts += fragments.masked_counts(rows[top : top + fragments.height].reshape(-1))
             top += fragments.height

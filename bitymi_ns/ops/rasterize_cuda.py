@@ -47,10 +47,10 @@ class _Rasterized(torch.autograd.Function):
         ctx.layout = layout_of({"masks": masks, **vars(bins)}, camera.width, camera.height)
         ctx.save_for_backward(g, b, t, texel_alpha, cuts, transmittance)
         ctx.projection, ctx.rim, ctx.moves, ctx.descent = projection, rim, moves, descent
-        return image
+        return image, ctx.layout
 
     @staticmethod
-    def backward(ctx, dimage):
+    def backward(ctx, dimage, _):
         geom, base, texels, texel_alpha, cuts, transmittance = ctx.saved_tensors
         pairs, kernels = ctx.layout.handle.pairs, module(geom.device)
         out = {
@@ -117,5 +117,5 @@ def rasterize_image(
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, even if nothing else learns
     alpha = None if projection.alpha is None else projection.alpha.values
-    image = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
-    return image, Unlisted(projection.detached(), rim)
+    image, layout = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
+    return image, Unlisted(projection.detached(), rim, layout=layout)

@@ -86,10 +86,15 @@ class Fragments:
         on_same_device(self.weight, mask=mask)
         if mask.numel() != self.width * self.height:
             raise ValueError(f"the mask has {mask.numel()} pixels, the view {self.width * self.height}")
-        counts = torch.zeros(self.surfels, dtype=torch.int32, device=mask.device)
-        flat = mask.reshape(-1).to(torch.uint8).contiguous()
-        function("masked_counts", mask.device)(**self.view, mask=flat, counts=counts)
-        return counts
+        return count_masked(self.view, mask, self.surfels)
+
+
+def count_masked(view: dict[str, Any], mask: Tensor, n: int) -> Tensor:
+    """Count as `Fragments.masked_counts`, for the list with the arguments `view` (`Fragments.view`): [n] int32."""
+    counts = torch.zeros(n, dtype=torch.int32, device=mask.device)
+    flat = mask.reshape(-1).to(torch.uint8).contiguous()
+    function("masked_counts", mask.device)(**view, mask=flat, counts=counts)
+    return counts
 
 
 def _for_layout(numbers: dict[str, Tensor], layout: Layout) -> dict[str, Tensor]:

@@ -12,42 +12,59 @@ from torch import Tensor, nn
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
+TOGETHER = 4  # steps whose losses are copied to the host together
+
 
 class LossWatch:
-    """Detector of losses that are not finite. On a CUDA device losses are copied to the host asynchronously and checked
-    a few steps later."""
+    """Detector of losses that are not finite.
+
+    On a CUDA device losses of several steps are copied to the host asynchronously and checked a few steps later.
+    """
 
     def __init__(self) -> None:
-        self._in_flight: deque[tuple[int, tuple[str, ...], Tensor, torch.cuda.Event]] = deque()
+        self._pending: list[tuple[int, tuple[str, ...], list[Tensor]]] = []
+        self._in_flight: deque[tuple[list[tuple[int, tuple[str, ...]]], Tensor, torch.cuda.Event]] = deque()
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
         """Check the loss terms of a step; on a CUDA device, a few steps later. Raises TrainingDiverged: a term of this
         or an earlier step is not finite."""
-        values = torch.stack([term.detach() for term in terms.values()])
-        if values.device.type != "cuda":
-            self._check(scene, step, tuple(terms), values)
+        names, values = tuple(terms), [term.detach() for term in terms.values()]
+        if values[0].device.type != "cuda":
+            self._check(scene, [(step, names)], torch.stack(values))
             return
+        self._pending.append((step, names, values))
+        if len(self._pending) >= TOGETHER:
+            self._send()
+        while self._in_flight and self._in_flight[0][2].query():
+            self._check(scene, *self._in_flight.popleft()[:2])
+
+    def _send(self) -> None:
+        if not self._pending:
+            return
+        values = torch.stack([value for _, _, values in self._pending for value in values])
         arrived = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
         arrived.copy_(values, non_blocking=True)
         event = torch.cuda.Event()
         event.record(torch.cuda.current_stream(values.device))
-        self._in_flight.append((step, tuple(terms), arrived, event))
-        while self._in_flight and self._in_flight[0][-1].query():
-            self._check(scene, *self._in_flight.popleft()[:-1])
+        self._in_flight.append(([(step, names) for step, names, _ in self._pending], arrived, event))
+        self._pending = []
 
     def finish(self, scene: Scene) -> None:
         """Wait for pending losses and check them; raises what `note` raises."""
+        self._send()
         while self._in_flight:
-            self._in_flight[0][-1].synchronize()
-            self._check(scene, *self._in_flight.popleft()[:-1])
+            self._in_flight[0][2].synchronize()
+            self._check(scene, *self._in_flight.popleft()[:2])
 
     def forget(self) -> None:
         """Discard pending losses after a rollback."""
         self._in_flight.clear()
+        self._pending.clear()
 
     @staticmethod
-    def _check(scene: Scene, step: int, names: tuple[str, ...], values: Tensor) -> None:
-        for name, value in zip(names, values.tolist(), strict=True):
+    def _check(scene: Scene, steps: list[tuple[int, tuple[str, ...]]], values: Tensor) -> None:
+        terms_of_steps = [(step, name) for step, names in steps for name in names]
+        for (step, name), value in zip(terms_of_steps, values.tolist(), strict=True):
             if not math.isfinite(value):
                 cause = describe_broken(scene) or "all parameters are finite; look for NaN in the images and cameras"
                 raise TrainingDiverged(f"the {name} loss is {value} at step {step}: {cause}")

@@ -59,7 +59,8 @@ def compared(
     kind: str = "sv",
     texture: str = "none",
     correction: str = "none",
-    masked: bool = False,
+    shown: float = 1.0,
+    weights: tuple[float, float] = (2.0, 3.0),
     background: str = "black",
     dropout: float = 0.0,
 ) -> dict[str, Tensor]:
@@ -69,7 +70,7 @@ def compared(
     descent = TexelDescent(scene.field.share, 0.7) if texture == "moved" else None
     g = torch.Generator().manual_seed(7)
     photo = torch.rand(HEIGHT, WIDTH, 3, generator=g).double().to(device)
-    mask = (torch.rand(HEIGHT, WIDTH, generator=g) < 0.7).to(device) if masked else None
+    mask = (torch.rand(HEIGHT, WIDTH, generator=g) < shown).to(device) if shown < 1.0 else None
     if mask is not None:
         photo[~mask] = math.nan
     values = CORRECTIONS[correction]
@@ -82,7 +83,8 @@ def compared(
     how = {"descent": descent, "dropout": dropout}
     with mock.patch("bitymi_ns.train.step.with_dropout", _dropout_of_the_cpu):  # random numbers depend on the device
         terms, output = view_losses(scene, View(camera, photo, mask, gains), schedule, step, LossWatch(), **how)
-    (2.0 * terms["photometric"] + 3.0 * terms["falloff"]).backward()
+    weighted = zip(weights, (terms["photometric"], terms["falloff"]), strict=True)
+    sum(weight * term for weight, term in weighted if weight).backward()
     assert isinstance(output, ComparedView) == ops.can_rasterize(device)
     found = {f"gradient of {name}": p.grad for name, p in scene.named_parameters() if p.grad is not None}
     found |= dict(terms) | {"gradient of the pose": pose.grad}
@@ -102,8 +104,10 @@ CASES = [
     *({"kind": kind} for kind in VIEW_COLORS),
     *({"texture": texture} for texture in ("texels", "moved", "alpha", "frozen")),
     *({"correction": correction, "background": "white"} for correction in ("gains", "affine")),
-    {"correction": "affine", "masked": True, "texture": "moved", "background": "random"},
-    {"masked": True, "texture": "alpha", "correction": "gains", "dropout": 0.3},
+    {"correction": "affine", "shown": 0.7, "texture": "moved", "background": "random"},
+    {"shown": 0.7, "texture": "alpha", "correction": "gains", "dropout": 0.3},
+    {"shown": 0.0, "texture": "texels"},
+    *({"weights": weights, "texture": "alpha"} for weights in ((1.0, 0.0), (0.0, 1.0))),
 ]
 
 

@@ -69,7 +69,10 @@ def read_result(work: Path, cell: Cell) -> dict[str, Any]:
             return {"results": {**results, "psnr": results["psnr"]}, "pictures": pictures}
         if not cell.ours:
             return {}
-        (curve,) = read_jsonl(output / CURVE).curves
+        curves = read_jsonl(output / CURVE).curves
+        if not curves:
+            raise ValueError(f"{CURVE} in it holds no point of a training curve")
+        curve = curves[0]
         figures = {name: curve.last(name) for name in ("seconds", "cpu_seconds", "surfels", "fragments")}
         return {"steps": curve.last("step"), **figures, "curve": (cell.output / CURVE).as_posix()}
 

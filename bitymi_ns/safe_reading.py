@@ -13,9 +13,11 @@ from io import BufferedReader, TextIOWrapper
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
+from pydantic import ValidationError
 from rich.filesize import decimal
 
 from bitymi_ns.exit_messages import out_of_memory
+from bitymi_ns.ranges import describe_problems
 from bitymi_ns.trust import LONGEST, json_of
 
 MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs need a tenth of it
@@ -80,6 +82,8 @@ def why(error: BaseException) -> str:
         return f"it is no text in {error.encoding.upper()} (byte {error.start})"
     if isinstance(error, KeyError):
         return f"the entry {error} is missing"
+    if isinstance(error, ValidationError):
+        return describe_problems(error)
     if out_of_memory(error):
         return "it takes more memory than there is"
     if isinstance(error, RecursionError):

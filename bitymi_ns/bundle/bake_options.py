@@ -10,7 +10,7 @@ from bitymi_ns.codec.limits import EXTENTS
 from bitymi_ns.codec.packing import check_page
 from bitymi_ns.codec.quantise import STEPS, Format, RangeRule
 from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ranges import Count, PositiveCount, check_ranges
+from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.tile_sizes import check_sides
 
 BundleFormat = Literal["compact", Format]
@@ -48,15 +48,15 @@ class BakeOptions:
     """Drop surfels that no training view blends (if views are given)."""
     range: RangeRule = "sigma6"
     """Quantisation range: sigma6 = mean +- 6 standard deviations, minmax = no clipping, auto = the smaller error."""
-    range_samples: PositiveCount = 1 << 18
+    range_samples: Annotated[int, Field(ge=1)] = 1 << 18
     """Texels in the bootstrap sample for the range."""
-    seed: Count = 0
+    seed: Annotated[int, Field(ge=0)] = 0
     """Seed of that sample."""
     page_width: int = 4096
     """Width of an atlas page in texels, a power of two; small atlases get narrower pages."""
     page_rows: int = 8192
     """Largest height of an atlas page; phones and WebGPU stop at 8192."""
-    chunk: PositiveCount = 1 << 18
+    chunk: Annotated[int, Field(ge=1)] = 1 << 18
     """Texels evaluated at once."""
 
     @property

@@ -1,13 +1,13 @@
 """Read EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, if plausible."""
 
 import math
+import struct
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from io import BytesIO
 from typing import Any
 
-from PIL import ExifTags, Image, TiffImagePlugin
+from PIL import ExifTags, Image
 
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres, of focal lengths "in 35 mm film"
 SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)  # aspect ratios of uncropped photographs
@@ -138,13 +138,16 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
     """Parse AccelerationVector (tag 8) of Apple's maker note, in g. Its axes point to the phone's left side as seen
     from its front, to its bottom, and into its face. For a phone held still it points away from the ground. The note
     has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its start."""
-    if note.startswith(b"Apple iOS\0") and note[12:14] == b"MM":
-        with suppress(Exception):  # Pillow raises many kinds on broken EXIF
-            entries, file = TiffImagePlugin.ImageFileDirectory_v2(b"MM\0*\0\0\0\x0e"), BytesIO(note)
-            file.seek(14)
-            entries.load(file)
-            x, y, z = map(float, entries[8])
-            return x, y, z
+    if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
+        return None
+    with suppress(struct.error, ZeroDivisionError):
+        (entries,) = struct.unpack_from(">H", note, 14)
+        for i in range(entries):
+            tag, kind, count, offset = struct.unpack_from(">HHII", note, 16 + 12 * i)
+            if (tag, kind, count) == (8, 10, 3):  # signed rationals
+                parts = struct.unpack_from(">6i", note, offset)
+                x, y, z = (parts[j] / parts[j + 1] for j in (0, 2, 4))
+                return x, y, z
     return None
 
 

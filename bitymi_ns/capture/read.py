@@ -83,7 +83,8 @@ def _naming_files() -> Iterator[None]:
 class CaptureOptions(SplitOptions, FrameOptions):
     """Options of reading a capture: path, format, files, points, frame and split."""
 
-    data: Path = Path()  # Folder, or file: transforms.json or video.
+    data: Path = Path()
+    """Folder, or file: transforms.json or video."""
     format: Format | Literal["auto"] = "auto"
     """Format to read where there are several; auto = one with poses before one without."""
     downscale_factor: int | None = None

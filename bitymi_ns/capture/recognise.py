@@ -136,7 +136,10 @@ def _scanned(folder: Path) -> Iterator[tuple[Format, Path]]:
     """Yield captures of scanning programs, and RGB-D sets with poses."""
     scanned = set()
     for row in SCANS:
-        files = [path for name in row.names.split() for path in sorted(folder.glob(name))[:1]]
+        files = []
+        for name in row.names.split():
+            exists = Path.is_file if row.mark or "." in name else Path.is_dir
+            files += [path for path in sorted(folder.glob(name)) if exists(path)][:1]
         complete = len(files) == len(row.names.split())
         if complete and (not row.mark or folder_contents.holds(files[0], row.mark.encode(), MOST_TEXT)):
             scanned.add(row.what)

@@ -67,6 +67,8 @@ def test_versions(surfels, tmp_path):
         (lambda i: i["surfels"].update(count=-1), "surfels.count must be greater than or equal to 0, not -1"),
         (lambda i: i["surfels"].update(count=True), "surfels.count must be a valid integer, not True"),
         (lambda i: i["surfels"].pop("count"), "surfels.count is missing"),
+        (lambda i: i.pop("surfels"), "surfels is missing"),
+        (lambda i: i["render"].update(near="close"), "render.near must be a valid number, not 'close'"),
         (lambda i: i["surfels"].update(view_color="sh"), "surfels.ply"),
         (lambda i: i["atlas"].update(width=20), "not those of"),
         (lambda i: i["atlas"].update(offset=10**400), "atlas.offset must be a finite number"),

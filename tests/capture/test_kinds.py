@@ -132,8 +132,9 @@ def test_lists_of_splits(row: Kind, name: str, whose: str, tmp_path: Path) -> No
 def test_scans(row: Kind, tmp_path: Path) -> None:
     for name in row.names.split():
         assert row.what not in [format for format, _ in _scanned(tmp_path)]
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name.replace("*", "0")).write_text(row.mark)
+        path = tmp_path / name.replace("*", "0")
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(row.mark) if row.mark or path.suffix else path.mkdir()
     assert [format for format, _ in _scanned(tmp_path)] == [row.what]
 
 

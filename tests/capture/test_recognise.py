@@ -267,3 +267,19 @@ def test_pictures_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     assert passed_over(tmp_path) == [
         f"1 .jxl of {tmp_path}/photos (no format of photographs, which is not read; save it as JPEG or TIFF)"
     ]
+
+
+def test_scans_are_told_by_files_and_folders(tmp_path: Path) -> None:
+    photograph(tmp_path / "images")
+    for name in ("keyframes", "cameras"):
+        (tmp_path / name).mkdir()
+    assert recognise(tmp_path).format == "photographs"
+    (tmp_path / "cameras/0.json").write_text("{}")
+    assert recognise(tmp_path).format == "polycam"
+    (tmp_path / "cameras").rename(tmp_path / "pose")
+    (tmp_path / "pose/0.txt").write_text("")
+    (tmp_path / "images").rename(tmp_path / "color")
+    assert recognise(tmp_path).format == "pose-files"
+    (tmp_path / "color").rename(tmp_path / "pictures")
+    (tmp_path / "color").write_bytes(b"")
+    assert recognise(tmp_path).format == "photographs"

@@ -146,6 +146,16 @@ def test_steps_keep_the_mean_and_the_limits(kind: str) -> None:
     assert exposure.table.abs().max() > 0.1
 
 
+def test_a_photograph_that_is_not_shown_keeps_its_moments() -> None:
+    exposure = started("gain", torch.zeros(3, 3))
+    for _ in range(3):
+        learn(exposure, 1).sum().backward()
+        exposure.step(0.01)
+    before = exposure.table.clone()
+    torch.testing.assert_close(before[0], before[2])  # both were moved by the mean only
+    assert bool((before[1] < before[0]).all())
+
+
 # when there are any
 
 

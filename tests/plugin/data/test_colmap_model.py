@@ -63,8 +63,10 @@ def test_two_forms_that_differ(project: Path, capsys: pytest.CaptureFixture[str]
         (folder / name).write_text(text)
     read_model(folder)
     assert "two models" not in printed(capsys)
-    (folder / "images.txt").write_text("\n".join(texts["images.txt"].split("\n")[:8]))
     (folder / "cameras.txt").write_text("1 PINHOLE 48 36 20 20 24 18\n")
+    read_model(folder)
+    assert f"{folder} holds two models, of 12 images in text and 12 in binary form" in printed(capsys)
+    (folder / "images.txt").write_text("\n".join(texts["images.txt"].split("\n")[:8]))
     assert len(read_model(folder).images) == 4
     assert f"{folder} holds two models, of 4 images in text and 12 in binary form" in printed(capsys)
 

@@ -67,8 +67,8 @@ def scanner_photographs(found: Found) -> list[Photograph]:
 
 def _polycam(folder: Path) -> list[ScannedPhotograph]:
     """Read Polycam's cameras and images, the corrected ones if there are any."""
-    places = ((base / i, base / c) for base in (folder / "keyframes", folder) for i, c in POLYCAM)
-    images, cameras = next((i, c) for i, c in places if i.is_dir() and any(c.glob("*.json")))
+    folders = ((base / i, base / c) for base in (folder / "keyframes", folder) for i, c in POLYCAM)
+    images, cameras = next((i, c) for i, c in folders if i.is_dir() and any(c.glob("*.json")))
     rows, pictures = [], _images(images)
     for path in sorted(cameras.glob("*.json"), key=lambda path: natural(path.name)):
         with parsing(path, AGAIN):

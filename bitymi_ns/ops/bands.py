@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from .backend import cuda_backend, on_same_device
+from .backend import cuda_backend
 from .capacity import TooManyFragments
 from .constants import TILE
 from .fragment_list import Layout
 from .project import Projection
-from .trace import Fragments, count_masked, trace
+from .trace import Fragments, check_mask, count_masked, trace
 
 T = TypeVar("T")
 
@@ -32,9 +32,12 @@ class Unlisted:
     projection: Projection
     rim: float  # as in `trace`
     most: int = 0  # largest number of fragments of a list, likewise
+    count: int | None = None  # number of fragments, where it is known
     layout: Layout | None = None  # pairs and masks of a view drawn without a list, which suffice for counts by surfel
 
     def __len__(self) -> int:
+        if self.count is not None:
+            return self.count
         camera = self.projection.camera
         every = torch.ones(camera.width * camera.height, dtype=torch.bool, device=self.projection.geom.device)
         return int(self.masked_counts(every).sum())
@@ -50,9 +53,7 @@ class Unlisted:
     def masked_counts(self, mask: Tensor) -> Tensor:
         """Count the fragments of each surfel on masked pixels; see `Fragments.masked_counts`."""
         camera, n = self.projection.camera, len(self.projection.geom)
-        on_same_device(self.projection.geom, mask=mask)
-        if mask.numel() != camera.width * camera.height:
-            raise ValueError(f"the mask has {mask.numel()} pixels, the view {camera.width * camera.height}")
+        check_mask(mask, self.projection.geom, camera.width, camera.height)
         if self.layout is not None:
             view = {"layout": self.layout.handle, "width": camera.width, "height": camera.height}
             return count_masked(view, mask, n)
@@ -132,18 +133,23 @@ def draw_by_lists(
         return draw(projection, most)
     except TooManyFragments as error:
         bands = split_refused(0, projection.camera.height, error)
+    counts: list[int] = []  # fragments of each band
 
     def draw_band(top: int, bottom: int) -> Tensor:
         part, limits = band(projection, top, bottom), [most]
 
         def draw_once(geom: Tensor) -> Tensor:
             # no limit in the backward pass: the band fitted in the forward pass
-            return draw(replace(part, geom=geom), limits.pop() if limits else None)[0]
+            forward = bool(limits)
+            image, fragments = draw(replace(part, geom=geom), limits.pop() if forward else None)
+            if forward:
+                counts.append(len(fragments))
+            return image
 
         return checkpoint(draw_once, part.geom, use_reentrant=False, preserve_rng_state=False)
 
     image = torch.cat([drawn for _, _, drawn in by_bands(bands, draw_band)])
-    return image, Unlisted(projection.detached(), rim, most)
+    return image, Unlisted(projection.detached(), rim, most, sum(counts))
 
 
 def split_refused(top: int, bottom: int, error: TooManyFragments) -> list[tuple[int, int]]:

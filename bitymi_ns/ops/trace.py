@@ -83,10 +83,15 @@ class Fragments:
     def masked_counts(self, mask: Tensor) -> Tensor:
         """Count the fragments of each surfel on the pixels of a mask [H * W] bool (FastGS's per-view importance): [N]
         int32. Raises ValueError: the mask has another number of pixels or lies on another device."""
-        on_same_device(self.weight, mask=mask)
-        if mask.numel() != self.width * self.height:
-            raise ValueError(f"the mask has {mask.numel()} pixels, the view {self.width * self.height}")
+        check_mask(mask, self.weight, self.width, self.height)
         return count_masked(self.view, mask, self.surfels)
+
+
+def check_mask(mask: Tensor, like: Tensor, width: int, height: int) -> None:
+    """Raise a ValueError unless a mask has a view's number of pixels and lies on the device of `like`."""
+    on_same_device(like, mask=mask)
+    if mask.numel() != width * height:
+        raise ValueError(f"the mask has {mask.numel()} pixels, the view {width * height}")
 
 
 def count_masked(view: dict[str, Any], mask: Tensor, n: int) -> Tensor:

@@ -7,7 +7,7 @@ import importlib.metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bitymi_ns.api import Bundle, Camera, View, bake_scene, load_capture, rasterize, read_bundle, train_scene
+    from .api import Bundle, Camera, View, bake_scene, load_capture, rasterize, read_bundle, train_scene
 
 __all__ = ["Bundle", "Camera", "View", "bake_scene", "load_capture", "rasterize", "read_bundle", "train_scene"]
 
@@ -17,6 +17,6 @@ def __getattr__(name: str) -> Any:
         return importlib.metadata.version("bitymi-ns")
     if name not in __all__:
         raise AttributeError(f"module 'bitymi_ns' has no attribute '{name}'")
-    from bitymi_ns import api  # lazily: nerfstudio imports this package to list its methods
+    from . import api  # lazily: nerfstudio imports this package to list its methods
 
     return getattr(api, name)

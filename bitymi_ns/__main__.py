@@ -6,7 +6,7 @@ import warnings
 
 def main() -> int:
     try:
-        from bitymi_ns import exit_messages
+        from . import exit_messages
     except KeyboardInterrupt:
         return 130
 
@@ -14,7 +14,7 @@ def main() -> int:
     warnings.filterwarnings("ignore", category=FutureWarning, module="nerfstudio")
 
     def command() -> int:
-        from bitymi_ns import cli
+        from . import cli
 
         return cli.main()
 

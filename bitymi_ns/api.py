@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake import BakeOptions, RefineOptions, bake, export
-from bitymi_ns.bake.compact import Compact
-from bitymi_ns.bundle import Bundle, read_bundle, reserved_bundle
-from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
-from bitymi_ns.bundle.parts import CAMERAS
-from bitymi_ns.capture.image_files import in_threads, pixels_of, read_image
-from bitymi_ns.capture.lens import Lens, make_lenses
-from bitymi_ns.capture.masks import checked_mask
-from bitymi_ns.capture.points import Points
-from bitymi_ns.capture.read import CaptureOptions, check_options, read_capture
-from bitymi_ns.capture.types import OPENCV_AXES, Photograph
-from bitymi_ns.ops import (
+from .bake import BakeOptions, RefineOptions, bake, export
+from .bake.compact import Compact
+from .bundle import Bundle, read_bundle, reserved_bundle
+from .bundle.cameras import CapturedCamera, cameras_data
+from .bundle.parts import CAMERAS
+from .capture.image_files import in_threads, pixels_of, read_image
+from .capture.lens import Lens, make_lenses
+from .capture.masks import checked_mask
+from .capture.points import Points
+from .capture.read import CaptureOptions, check_options, read_capture
+from .capture.types import OPENCV_AXES, Photograph
+from .ops import (
     Fragments,
     Projection,
     blended_image,
@@ -32,18 +32,18 @@ from bitymi_ns.ops import (
     rasterize_image,
     trace,
 )
-from bitymi_ns.ops.backend import on_same_device
-from bitymi_ns.ops.capacity import memory_errors
-from bitymi_ns.ops.constants import BETA_MAX, COLOR_BIAS
-from bitymi_ns.ops.project import geometry_of
-from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import NEAR, RenderOutput, Scene
-from bitymi_ns.train.config import RefinePoses
-from bitymi_ns.train.fit import TrainLog, fit
-from bitymi_ns.train.init import scene_for_views
-from bitymi_ns.train.preset import load_preset
-from bitymi_ns.train.view_checks import check_counted, check_points, checked_views, learning_modes
-from bitymi_ns.train.views import View
+from .ops.backend import on_same_device
+from .ops.capacity import memory_errors
+from .ops.constants import BETA_MAX, COLOR_BIAS
+from .ops.project import geometry_of
+from .scene.camera import Camera
+from .scene.scene import NEAR, RenderOutput, Scene
+from .train.config import RefinePoses
+from .train.fit import TrainLog, fit
+from .train.init import scene_for_views
+from .train.preset import load_preset
+from .train.view_checks import check_counted, check_points, checked_views, learning_modes
+from .train.views import View
 
 __all__ = ["Bundle", "Camera", "View", "bake_scene", "load_capture", "rasterize", "read_bundle", "train_scene"]
 

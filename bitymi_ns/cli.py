@@ -11,12 +11,12 @@ from typing import Annotated, Literal, TextIO
 
 import tyro
 
-from bitymi_ns import exit_messages
-from bitymi_ns.capture.types import SfmOptions
-from bitymi_ns.errors import KernelsUnavailable
-from bitymi_ns.files import write_errors_as
-from bitymi_ns.measure.bench.cli import BenchRun
-from bitymi_ns.trust import listed, printable
+from . import exit_messages
+from .capture.types import SfmOptions
+from .errors import KernelsUnavailable
+from .files import write_errors_as
+from .measure.bench.cli import BenchRun
+from .trust import listed, printable
 
 
 def say(text: object, to: TextIO | None = None) -> None:
@@ -41,8 +41,8 @@ class Sample:
     overwrite: Flag = False  # Replace the folder if it holds something.
 
     def run(self) -> None:
-        from bitymi_ns import sample
-        from bitymi_ns.progress import rich_progress
+        from . import sample
+        from .progress import rich_progress
 
         with write_errors_as(self.output_dir, ValueError), rich_progress() as progress:
             folder = sample.generate(**vars(self), progress=progress)
@@ -59,10 +59,10 @@ class Sfm:
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
 
     def run(self) -> None:
-        from bitymi_ns.capture.frame import gps_line
-        from bitymi_ns.capture.nerfstudio import write_capture
-        from bitymi_ns.capture.poses import find_poses
-        from bitymi_ns.progress import rich_progress
+        from .capture.frame import gps_line
+        from .capture.nerfstudio import write_capture
+        from .capture.poses import find_poses
+        from .progress import rich_progress
 
         with rich_progress() as progress:
             poses = find_poses(self.source, self.options, progress, lambda text: say(text, sys.stderr))
@@ -92,7 +92,7 @@ class Report:
     title: str = "bitymi report"  # Heading of the page.
 
     def run(self) -> None:
-        from bitymi_ns.measure.report import page
+        from .measure.report import page
 
         say(f"Wrote {page.build(self.inputs, self.output_dir, self.title)}")
 
@@ -105,8 +105,8 @@ class Stability:
     backend: Literal["cpu", "cuda", "emulated"] = "cpu"  # Kernels to measure.
 
     def run(self) -> None:
-        from bitymi_ns.measure.stability import page
-        from bitymi_ns.measure.stability.errors import BACKENDS, missing
+        from .measure.stability import page
+        from .measure.stability.errors import BACKENDS, missing
 
         if why := missing(BACKENDS[self.backend]):
             raise ValueError(f"the backend '{self.backend}' cannot be used here: {why}")
@@ -152,14 +152,14 @@ class Verify:
         from rich.markup import escape
         from rich.table import Table
 
-        from bitymi_ns.bundle import REMEDY, check_files
-        from bitymi_ns.bundle.parts import NOTES
+        from .bundle import REMEDY, check_files
+        from .bundle.parts import NOTES
 
         if self.views is not None and self.run_config is None:
             raise ValueError("--views is for the comparison with a run: name that, too (--run)")
         bundle, checks = check_files(self.bundle)
         if bundle is not None and self.run_config is not None:
-            from bitymi_ns.plugin.export.trained import check_run
+            from .plugin.export.trained import check_run
 
             checks += check_run(bundle, self.run_config, 4 if self.views is None else self.views)
         table = Table("", "check", "result", title=escape(printable(f"Bundle {self.bundle}")))
@@ -192,8 +192,8 @@ class Pack:
     overwrite: Flag = False  # Replace an existing single-file bundle.
 
     def run(self) -> None:
-        from bitymi_ns.bundle.single import SUFFIX, is_single, write_single
-        from bitymi_ns.files import size_text
+        from .bundle.single import SUFFIX, is_single, write_single
+        from .files import size_text
 
         bundle = Path(os.path.realpath(self.bundle))
         output = self.output or bundle.with_name(bundle.name + SUFFIX)
@@ -215,9 +215,9 @@ class Unpack:
     output: Path | None = None  # Folder to write; not given: beside the file, with its name without .bitymi.
 
     def run(self) -> None:
-        from bitymi_ns.bundle.read import read_manifest
-        from bitymi_ns.bundle.single import SUFFIX, write_folder
-        from bitymi_ns.plugin.export.target import CONFIG, config_without_run
+        from .bundle.read import read_manifest
+        from .bundle.single import SUFFIX, write_folder
+        from .plugin.export.target import CONFIG, config_without_run
 
         folder = self.output or self.bundle.with_name(self.bundle.name.removesuffix(SUFFIX))
         config = config_without_run(folder, read_manifest(self.bundle))
@@ -240,9 +240,9 @@ class Extras:
     overwrite: Flag = False  # Replace an existing folder of extras.
 
     def run(self) -> None:
-        from bitymi_ns.bundle import read_bundle
-        from bitymi_ns.interchange import extras
-        from bitymi_ns.progress import rich_progress
+        from .bundle import read_bundle
+        from .interchange import extras
+        from .progress import rich_progress
 
         output = self.output or extras.extras_folder(self.bundle)
         bundle = read_bundle(self.bundle, crop=self.crop)
@@ -276,9 +276,9 @@ class View:
     def run(self) -> None:
         import webbrowser
 
-        from bitymi_ns import view
-        from bitymi_ns.bundle.notes import hides
-        from bitymi_ns.files import size_text
+        from . import view
+        from .bundle.notes import hides
+        from .files import size_text
 
         if self.one_file and self.export is None:
             raise ValueError("--one-file is for --export: say where to")
@@ -311,7 +311,7 @@ class Doctor:
     """Describe this installation for a report of a problem, and try a training step on every device."""
 
     def run(self) -> int:
-        from bitymi_ns.measure.doctor import examine
+        from .measure.doctor import examine
 
         for name, line in examine():
             say(f"{name:11} {line or 'ns-train bitymi cannot train here'}")

@@ -13,8 +13,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, TextIO
 
-from bitymi_ns.files import Busy, reason
-from bitymi_ns.trust import Refused, printable
+from .files import Busy, reason
+from .trust import Refused, printable
 
 INTERRUPTED = 130  # exit statuses by shell convention: 128 + signal number
 NO_READER = 141

@@ -18,8 +18,8 @@ from typing import BinaryIO
 
 from rich.filesize import decimal
 
-from bitymi_ns.locks import Busy, Tell, held, hold, open_locked, release
-from bitymi_ns.trust import UNFINISHED, Refused, is_left
+from .locks import Busy, Tell, held, hold, open_locked, release
+from .trust import UNFINISHED, Refused, is_left
 
 _REASONS = {
     errno.EROFS: "the file system is read-only: write to another one",

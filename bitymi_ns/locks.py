@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from bitymi_ns.trust import no_links
+from .trust import no_links
 
 Tell = Callable[[str], None]  # receives a warning for the user
 

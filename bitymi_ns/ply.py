@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.safe_reading import open_regular
+from .safe_reading import open_regular
 
 HEADER_LIMIT = 1 << 16  # maximum length of a header, bytes
 _TYPES = {

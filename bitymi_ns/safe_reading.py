@@ -16,9 +16,9 @@ from typing import Any, NoReturn, TextIO
 from pydantic import ValidationError
 from rich.filesize import decimal
 
-from bitymi_ns.exit_messages import out_of_memory
-from bitymi_ns.ranges import describe_problems
-from bitymi_ns.trust import LONGEST, json_of
+from .exit_messages import out_of_memory
+from .ranges import describe_problems
+from .trust import LONGEST, json_of
 
 MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs need a tenth of it
 

@@ -75,6 +75,14 @@ def test_no_module_imports_what_the_package_itself_defines() -> None:
         assert module == "bitymi_ns" or not found, f"{path} imports {found}"
 
 
+def test_a_module_imports_its_siblings_relatively() -> None:
+    for module, path in MODULES.items():
+        package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+        for node in ast.walk(ast.parse(path.read_text("utf8"))):
+            if isinstance(node, ast.ImportFrom) and not node.level:
+                assert not f"{node.module}.".startswith(f"{package}."), f"{path} imports {node.module}: from .NAME"
+
+
 def test_nerfstudio_is_known_to_the_plugin_and_to_what_measures_it_alone() -> None:
     for path in PACKAGE.rglob("*.py"):
         knows = path.relative_to(PACKAGE).as_posix().startswith(KNOW_NERFSTUDIO)

@@ -8,10 +8,6 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.precision import PER_BIT, Pictures, column_noise
-from bitymi_ns.bake.stages import Reduced, Rounded, laid_out, with_means
-from bitymi_ns.bake.tiles import Tiles
-from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.poster import most_bytes as poster_bytes
 from bitymi_ns.bundle.statistics import Rounding, ViewColorError
 from bitymi_ns.codec import streams
@@ -20,6 +16,10 @@ from bitymi_ns.codec.surfel_codes import code_surfels
 from bitymi_ns.codec.texel_codes import TexelCoder, TexelCodes, residual_codes
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.train.views import View
+from .precision import PER_BIT, Pictures, column_noise
+from .stages import Reduced, Rounded, laid_out, with_means
+from .tiles import Tiles
+from .tuning_views import TexelList
 
 START = 8.0 / 255**2  # first lambda of the search: squared error per bit, colours from 0 to 1
 MAX_LAMBDA = 4.0 / 255**2

@@ -10,14 +10,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.compact import Compact, compacted
-from bitymi_ns.bake.field.tiles import field_tiles
-from bitymi_ns.bake.field.train_texels import PolishOptions, polish_scene
-from bitymi_ns.bake.prune import drawable, prune_and_resample
-from bitymi_ns.bake.stages import BakeableScene, Coded, Trained, laid_out
-from bitymi_ns.bake.tile_errors import certified
-from bitymi_ns.bake.tiles import Tiles
-from bitymi_ns.bake.tune import TuneOptions, tune_atlas
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.codec.pages import joined
 from bitymi_ns.ops.view_kinds import kind_of
@@ -28,6 +20,14 @@ from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.config import TrainConfig
 from bitymi_ns.train.views import View
 from bitymi_ns.trust import listed
+from .compact import Compact, compacted
+from .field.tiles import field_tiles
+from .field.train_texels import PolishOptions, polish_scene
+from .prune import drawable, prune_and_resample
+from .stages import BakeableScene, Coded, Trained, laid_out
+from .tile_errors import certified
+from .tiles import Tiles
+from .tune import TuneOptions, tune_atlas
 
 
 @torch.no_grad()

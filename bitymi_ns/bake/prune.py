@@ -7,10 +7,6 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.inputs import BakeInput, photo_resolution
-from bitymi_ns.bake.stages import Reduced, Trained
-from bitymi_ns.bake.tiles import Tiles, reduced_tiles
-from bitymi_ns.bake.view_colors import reduce_view_colors
 from bitymi_ns.bundle.statistics import KeptSurfels, KeptTexels, LeftOut
 from bitymi_ns.codec.limits import within
 from bitymi_ns.ops.constants import ALPHA_MIN
@@ -19,6 +15,10 @@ from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
+from .inputs import BakeInput, photo_resolution
+from .stages import Reduced, Trained
+from .tiles import Tiles, reduced_tiles
+from .view_colors import reduce_view_colors
 
 
 def drawable(surfels: Tensors) -> tuple[Tensor, Counter[str]]:

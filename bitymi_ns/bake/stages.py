@@ -12,8 +12,6 @@ from typing import Any, Protocol, TypeVar
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.tiles import Tiles
-from bitymi_ns.bake.view_colors import ColorChoices
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.poster import draw_poster
 from bitymi_ns.bundle.read import Bundle
@@ -30,6 +28,8 @@ from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+from .tiles import Tiles
+from .view_colors import ColorChoices
 
 S = TypeVar("S", bound="Stage")
 

@@ -7,14 +7,14 @@ from itertools import chain
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.stages import Coded
-from bitymi_ns.bake.tiles import TileVisibility, weighted_rms, weights
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.codec.pages import first_texels, listed_tiles
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters, max_projected_extent
 from bitymi_ns.train.init import tangents
+from .stages import Coded
+from .tiles import TileVisibility, weighted_rms, weights
 
 _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is evaluated
 

@@ -8,13 +8,13 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.codec.pages import first_texels, listed_tiles
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.tile_sizes import kernel_parameters
+from .inputs import BakeInput
 
 ALPHA_CONTRAST = 0.25  # weight of an error of alpha: typical difference between a surfel's colour and that behind it
 

@@ -11,9 +11,6 @@ import torch
 from pydantic import NonNegativeInt
 from torch import Tensor
 
-from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, gain, validation_split
-from bitymi_ns.bake.stages import Coded, Reduced, Rounded, encoded_texels
-from bitymi_ns.bake.tuning_views import TexelList, TuningViews
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.codec.pages import first_texels, listed_texels
 from bitymi_ns.codec.texel_codes import TexelCoder, TexelCodes
@@ -22,6 +19,9 @@ from bitymi_ns.ranges import Count, Positive, PositiveCount, Share, check_ranges
 from bitymi_ns.train.config import TexelSteps
 from bitymi_ns.train.schedules import falling
 from bitymi_ns.train.views import MemoryBudget, View, training_order
+from .early_stopping import FEWEST_VIEWS, EarlyStopping, gain, validation_split
+from .stages import Coded, Reduced, Rounded, encoded_texels
+from .tuning_views import TexelList, TuningViews
 
 TO_START = 0.93  # share of the byte limit for coded texels before the last steps, in which they grow a little
 TO_FILL = 0.99  # share of the byte limit that the last steps aim at, where it is to be used up

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.early_stopping import evaluate
-from bitymi_ns.bake.stages import Stage
 from bitymi_ns.ops import (
     Fragments,
     Projection,
@@ -25,6 +23,8 @@ from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import count_values, photometric
 from bitymi_ns.train.views import MemoryBudget, View, shown
+from .early_stopping import evaluate
+from .stages import Stage
 
 
 class TexelList:

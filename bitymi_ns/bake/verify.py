@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.view_colors import centers_of, view_color_errors
 from bitymi_ns.bundle.read import Bundle
 from bitymi_ns.bundle.verify import SLACK_STEPS, Check, steps_text
 from bitymi_ns.codec.pages import texel_alpha
@@ -13,6 +12,7 @@ from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.scene.visibility import visibility
+from .view_colors import centers_of, view_color_errors
 
 _SLACK = 1.02  # largest ratio to the stated error: sums in another order, rotations that were written with length 1
 

@@ -7,8 +7,6 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns.bake.directions import Directions, view_directions
-from bitymi_ns.bake.inputs import BakeInput
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.statistics import Kept, Percentiles, ViewColorError
 from bitymi_ns.codec.limits import beyond
@@ -20,6 +18,8 @@ from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere, kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.tile_sizes import kernel_parameters
+from .directions import Directions, view_directions
+from .inputs import BakeInput
 
 BITS_PER_NUMBER = 5.5  # approximate bits per number of a term in a compact bundle
 LEAST_WEIGHT = 1e-12  # added to the weight of every direction, so that surfels which no view shows have a mean

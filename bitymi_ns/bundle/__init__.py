@@ -1,11 +1,11 @@
 """Bundles, the folders of baked scenes (surfels, atlas, description): writing, reading, checking."""
 
-from bitymi_ns.bundle.manifest import BundleError
-from bitymi_ns.bundle.parts import reserved_bundle
-from bitymi_ns.bundle.read import REMEDY, Bundle, read_bundle
-from bitymi_ns.bundle.verify import Check, check_files, check_world
-from bitymi_ns.bundle.world import World
-from bitymi_ns.bundle.write import write_bundle
+from .manifest import BundleError
+from .parts import reserved_bundle
+from .read import REMEDY, Bundle, read_bundle
+from .verify import Check, check_files, check_world
+from .world import World
+from .write import write_bundle
 
 __all__ = [
     "REMEDY",

@@ -9,10 +9,10 @@ import torch
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 from torch import Tensor
 
-from bitymi_ns.bundle import strict_json
-from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.ranges import first_problem
 from bitymi_ns.scene.camera import Camera
+from . import strict_json
+from .manifest import BundleError
 
 MOST_CAMERAS = 100_000
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]

@@ -12,13 +12,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle.manifest import COMPACT_SURFELS, TEXELS, AtlasEntry, ColumnEntry, Manifest, Surfels
 from bitymi_ns.codec import streams
 from bitymi_ns.codec.packing import Packing, pack
 from bitymi_ns.codec.streams import StreamError
 from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, Codes, PositionGrid, SurfelCodes, columns_of
 from bitymi_ns.codec.texel_codes import GRADES, AlphaCodes, TexelCodes, blocks_of, coefficient_columns
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from .manifest import COMPACT_SURFELS, TEXELS, AtlasEntry, ColumnEntry, Manifest, Surfels
 
 if TYPE_CHECKING:
     from hashlib import _Hash as Digest

@@ -15,13 +15,13 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 from torch import Tensor
 
-from bitymi_ns.bundle import strict_json
-from bitymi_ns.bundle.statistics import Decibels, Part, Share, Statistics, Whole
-from bitymi_ns.bundle.world import Coordinate, WorldEntry
 from bitymi_ns.codec.limits import ALPHA_SCALE, EXTENTS, LIMITS, RESIDUAL_LIMIT
 from bitymi_ns.ops.constants import ALPHA_MAX, ALPHA_MIN, COLOR_BIAS, SUPPORT, TRANSMITTANCE_MIN
 from bitymi_ns.ops.view_kinds import Kind
 from bitymi_ns.ranges import describe_problems, short
+from . import strict_json
+from .statistics import Decibels, Part, Share, Statistics, Whole
+from .world import Coordinate, WorldEntry
 
 FORMAT = "bitymi-bundle"
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"

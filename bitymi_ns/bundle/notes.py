@@ -7,12 +7,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from bitymi_ns.bundle import strict_json
-from bitymi_ns.bundle.manifest import BundleError
-from bitymi_ns.bundle.parts import NOTES, Parts, notes_data, parts_of
-from bitymi_ns.bundle.world import UNIT_LENGTH
 from bitymi_ns.ranges import first_problem
 from bitymi_ns.scene.crop import Box, Crop, vector
+from . import strict_json
+from .manifest import BundleError
+from .parts import NOTES, Parts, notes_data, parts_of
+from .world import UNIT_LENGTH
 
 NEWEST = 2  # version; the page writes 1 where nothing of version 2 is used
 SINCE_2 = ("measures", "unit", "crop", "hidden")

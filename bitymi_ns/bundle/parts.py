@@ -11,7 +11,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from bitymi_ns import safe_reading
-from bitymi_ns.bundle.manifest import (
+from bitymi_ns.files import reserved, write_errors_as
+from bitymi_ns.locks import Tell
+from bitymi_ns.trust import check_replaceable, json_of
+from .manifest import (
     ATLAS,
     COMPACT_SURFELS,
     MANIFEST,
@@ -22,9 +25,6 @@ from bitymi_ns.bundle.manifest import (
     Manifest,
     dump,
 )
-from bitymi_ns.files import reserved, write_errors_as
-from bitymi_ns.locks import Tell
-from bitymi_ns.trust import check_replaceable, json_of
 
 MANIFEST_LIMIT = 4 << 20  # largest bundle.json, bytes
 DIRECTORY_LIMIT = 4 << 20  # largest ZIP directory of a bundle in one file, bytes

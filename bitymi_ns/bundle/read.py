@@ -15,9 +15,17 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ply
-from bitymi_ns.bundle import compact, ktx2
-from bitymi_ns.bundle.cameras import CapturedCamera, parse_cameras
-from bitymi_ns.bundle.manifest import (
+from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
+from bitymi_ns.codec.limits import ALPHA_LIMIT, RESIDUAL_LIMIT
+from bitymi_ns.codec.quantise import Range, byte_pages, decode_pages
+from bitymi_ns.codec.streams import StreamError
+from bitymi_ns.codec.texel_codes import constants, mean_alphas_of
+from bitymi_ns.ops.constants import SUPPORT
+from bitymi_ns.scene.baked import BakedOutput, BakedScene
+from bitymi_ns.scene.camera import Camera
+from . import compact, ktx2
+from .cameras import CapturedCamera, parse_cameras
+from .manifest import (
     ATLAS,
     COMPACT_SURFELS,
     MANIFEST,
@@ -28,18 +36,10 @@ from bitymi_ns.bundle.manifest import (
     parse,
     points_of,
 )
-from bitymi_ns.bundle.notes import NotesError, crop_of
-from bitymi_ns.bundle.parts import CAMERAS, MANIFEST_LIMIT, NOTES, MissingPart, Parts, instead_of, parts_of
-from bitymi_ns.bundle.sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
-from bitymi_ns.bundle.surfel_table import TERMS, from_columns
-from bitymi_ns.codec.bc7_encode import Profile, bc7_blocks
-from bitymi_ns.codec.limits import ALPHA_LIMIT, RESIDUAL_LIMIT
-from bitymi_ns.codec.quantise import Range, byte_pages, decode_pages
-from bitymi_ns.codec.streams import StreamError
-from bitymi_ns.codec.texel_codes import constants, mean_alphas_of
-from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.scene.baked import BakedOutput, BakedScene
-from bitymi_ns.scene.camera import Camera
+from .notes import NotesError, crop_of
+from .parts import CAMERAS, MANIFEST_LIMIT, NOTES, MissingPart, Parts, instead_of, parts_of
+from .sizes import HEAD, SCENE_FILES, check_head, check_memory, enough_memory
+from .surfel_table import TERMS, from_columns
 
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
 """Advice on a damaged bundle."""

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError, Manifest
-from bitymi_ns.bundle.notes import read_notes
-from bitymi_ns.bundle.parts import MANIFEST_LIMIT, NOTES, Parts, is_known, left_out, parts_of, public_manifest
-from bitymi_ns.bundle.read import manifest_of, read_file, read_manifest
-from bitymi_ns.bundle.sizes import enough_memory, machine_memory
 from bitymi_ns.files import complete_file, complete_folder, size_text
+from .manifest import ATLAS, COMPACT_SURFELS, MANIFEST, POSTER, SURFELS, TEXELS, BundleError, Manifest
+from .notes import read_notes
+from .parts import MANIFEST_LIMIT, NOTES, Parts, is_known, left_out, parts_of, public_manifest
+from .read import manifest_of, read_file, read_manifest
+from .sizes import enough_memory, machine_memory
 
 _ORDER = (POSTER, COMPACT_SURFELS, TEXELS, SURFELS, ATLAS)
 SUFFIX = ".bitymi"

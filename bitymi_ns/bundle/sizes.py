@@ -8,11 +8,11 @@ from pathlib import Path
 import psutil
 
 from bitymi_ns import ply
-from bitymi_ns.bundle import compact, ktx2
-from bitymi_ns.bundle.manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS, TEXELS, BundleError, Manifest
-from bitymi_ns.bundle.surfel_table import TERMS
 from bitymi_ns.exit_messages import out_of_memory
 from bitymi_ns.files import size_text
+from . import compact, ktx2
+from .manifest import ATLAS, COMPACT_SURFELS, MANIFEST, SURFELS, TEXELS, BundleError, Manifest
+from .surfel_table import TERMS
 
 SCENE_FILES = frozenset((SURFELS, ATLAS, COMPACT_SURFELS, TEXELS))  # surfels and texels
 HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # leading bytes that `check_head` reads

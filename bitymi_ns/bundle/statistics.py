@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_serializer
 from torch import Tensor
 
-from bitymi_ns.bundle.bake_options import BakeOptions
+from .bake_options import BakeOptions
 
 _LARGEST = 1e12
 _P = TypeVar("_P", bound="Part")

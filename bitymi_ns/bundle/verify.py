@@ -7,13 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.bundle import compact
-from bitymi_ns.bundle.manifest import MANIFEST, BundleError, Manifest
-from bitymi_ns.bundle.notes import read_notes
-from bitymi_ns.bundle.parts import NOTES, Parts, parts_of
-from bitymi_ns.bundle.read import CONTENTS, Bundle, assemble, manifest_of, read_file
-from bitymi_ns.bundle.sizes import enough_memory
-from bitymi_ns.bundle.world import World, WorldEntry
+from . import compact
+from .manifest import MANIFEST, BundleError, Manifest
+from .notes import read_notes
+from .parts import NOTES, Parts, parts_of
+from .read import CONTENTS, Bundle, assemble, manifest_of, read_file
+from .sizes import enough_memory
+from .world import World, WorldEntry
 
 SLACK_STEPS = 0.02  # 8-bit steps by which a measured error may exceed the stated one
 

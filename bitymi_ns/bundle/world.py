@@ -11,8 +11,8 @@ import numpy.typing as npt
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from bitymi_ns.bundle.statistics import Part
 from bitymi_ns.codec.limits import LIMITS
+from .statistics import Part
 
 UNIT_LENGTH = 1e-3  # tolerance of a unit vector's length
 

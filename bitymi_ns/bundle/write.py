@@ -13,8 +13,15 @@ from typing import Any
 import torch
 
 from bitymi_ns import ply
-from bitymi_ns.bundle import compact, ktx2
-from bitymi_ns.bundle.manifest import (
+from bitymi_ns.codec.limits import ALPHA_LIMIT
+from bitymi_ns.codec.quantise import Atlas, EncodedAtlas
+from bitymi_ns.codec.texel_codes import SceneCodes
+from bitymi_ns.files import complete_folder, reason, size_text
+from bitymi_ns.ops.view_color import check_lean
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
+from bitymi_ns.scene.baked import BakedScene
+from . import compact, ktx2
+from .manifest import (
     ACTIVATIONS,
     ATLAS,
     COMPACT_SURFELS,
@@ -29,18 +36,11 @@ from bitymi_ns.bundle.manifest import (
     dump,
     points_text,
 )
-from bitymi_ns.bundle.parts import NOTES, check_target, notes_data, parts_of
-from bitymi_ns.bundle.poster import Pixels, encode_poster, most_bytes
-from bitymi_ns.bundle.read import Bundle, read_bundle, read_manifest
-from bitymi_ns.bundle.surfel_table import EXTENT_COLUMN, TERMS, check_limits, term_columns, to_columns
-from bitymi_ns.bundle.world import World, same_frame
-from bitymi_ns.codec.limits import ALPHA_LIMIT
-from bitymi_ns.codec.quantise import Atlas, EncodedAtlas
-from bitymi_ns.codec.texel_codes import SceneCodes
-from bitymi_ns.files import complete_folder, reason, size_text
-from bitymi_ns.ops.view_color import check_lean
-from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from bitymi_ns.scene.baked import BakedScene
+from .parts import NOTES, check_target, notes_data, parts_of
+from .poster import Pixels, encode_poster, most_bytes
+from .read import Bundle, read_bundle, read_manifest
+from .surfel_table import EXTENT_COLUMN, TERMS, check_limits, term_columns, to_columns
+from .world import World, same_frame
 
 GENERATOR = f"bitymi-ns {importlib.metadata.version('bitymi-ns')}"
 _CHUNK = 1 << 22

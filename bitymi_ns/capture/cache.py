@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Literal
 
 from bitymi_ns import files, locks
-from bitymi_ns.capture.types import CaptureError, fail
 from bitymi_ns.files import Tell, write_file
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
+from .types import CaptureError, fail
 
 FOLDER = ".bitymi"
 OF = "of.json"  # file in a work folder with its source and key

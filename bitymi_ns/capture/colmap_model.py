@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.points import color_bytes, read_cloud
-from bitymi_ns.capture.recognise import image_count
-from bitymi_ns.capture.transforms import MAX_SIDE
-from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, fail, parsing, warn
 from bitymi_ns.safe_reading import open_text, read_bytes
 from bitymi_ns.trust import listed
+from . import pycolmap
+from .points import color_bytes, read_cloud
+from .recognise import image_count
+from .transforms import MAX_SIDE
+from .types import SPHERICAL_MODEL, ColmapCamera, fail, parsing, warn
 
 FORMS = (".txt", ".bin")
 MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a twentieth of it

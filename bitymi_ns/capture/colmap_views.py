@@ -9,16 +9,16 @@ from typing import Literal
 
 import numpy as np
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.colmap_model import Model, read_model
-from bitymi_ns.capture.find_files import FileFinder, report_renamed
-from bitymi_ns.capture.folder_contents import images_of, photographs_below, photographs_in, result_in
-from bitymi_ns.capture.image_files import image_size, in_proportion
-from bitymi_ns.capture.masks import USUAL_FOLDERS
-from bitymi_ns.capture.points import Points
-from bitymi_ns.capture.recognise import Found
-from bitymi_ns.capture.types import OPENCV_AXES, Photograph, Pose, SfmSettings, fail, warn
 from bitymi_ns.trust import leads_inside, listed
+from . import pycolmap
+from .colmap_model import Model, read_model
+from .find_files import FileFinder, report_renamed
+from .folder_contents import images_of, photographs_below, photographs_in, result_in
+from .image_files import image_size, in_proportion
+from .masks import USUAL_FOLDERS
+from .points import Points
+from .recognise import Found
+from .types import OPENCV_AXES, Photograph, Pose, SfmSettings, fail, warn
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Transform [4, 4] from COLMAP's world, up about -y, to z up, as in nerfstudio's COLMAP parser."""

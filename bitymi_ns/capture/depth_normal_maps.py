@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import TiffImagePlugin
 
-from bitymi_ns.capture.folder_contents import open_picture
-from bitymi_ns.capture.image_files import wrong_size
-from bitymi_ns.capture.lens import Lens
-from bitymi_ns.capture.masks import in_proportion
-from bitymi_ns.capture.types import MAP_FILES, MapFiles, fail, parsing, warn
 from bitymi_ns.ranges import spread
 from bitymi_ns.safe_reading import open_regular
+from .folder_contents import open_picture
+from .image_files import wrong_size
+from .lens import Lens
+from .masks import in_proportion
+from .types import MAP_FILES, MapFiles, fail, parsing, warn
 
 MILLIMETER = 1e-3  # metres per unit of integer depth unless stated: nerfstudio's convention
 COLOR_SAMPLES = 8  # files of a folder of depth that are tested; if all are color pictures, it is not used

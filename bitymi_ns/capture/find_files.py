@@ -11,11 +11,11 @@ from functools import cached_property
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from bitymi_ns.capture.folder_contents import images_of, passed_over, result_in
-from bitymi_ns.capture.kinds import PHOTOGRAPHS
-from bitymi_ns.capture.recognise import Found, models_in
-from bitymi_ns.capture.types import MAP_FILES, MapFiles, Photograph, fail, say, warn
 from bitymi_ns.trust import leads_inside, listed, told_apart
+from .folder_contents import images_of, passed_over, result_in
+from .kinds import PHOTOGRAPHS
+from .recognise import Found, models_in
+from .types import MAP_FILES, MapFiles, Photograph, fail, say, warn
 
 Parts = tuple[str, ...]  # folders and file of a name, in one case and one Unicode form
 _DRIVE = re.compile(r"^[A-Za-z]:")

@@ -13,10 +13,10 @@ from pathlib import Path
 import pillow_heif
 from PIL import Image
 
-from bitymi_ns.capture import kinds
-from bitymi_ns.capture.kinds import Kind
 from bitymi_ns.safe_reading import MOST_TEXT, open_regular
 from bitymi_ns.trust import listed
+from . import kinds
+from .kinds import Kind
 
 pillow_heif.register_heif_opener()  # for all users of Pillow
 

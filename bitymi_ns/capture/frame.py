@@ -11,10 +11,10 @@ import numpy as np
 from pydantic import Field, TypeAdapter
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.types import warn
 from bitymi_ns.files import write_file
 from bitymi_ns.safe_reading import read_json
+from . import pycolmap
+from .types import warn
 
 GPS_ERROR = 5.0  # of phones, metres
 LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions that determines the scale, metres

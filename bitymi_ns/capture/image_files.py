@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import EpsImagePlugin, ExifTags, Image, ImageCms
 
-from bitymi_ns.capture.exif import exif_stops, exposure_settings
-from bitymi_ns.capture.folder_contents import open_picture
-from bitymi_ns.capture.types import Photograph, fail, parsing
+from .exif import exif_stops, exposure_settings
+from .folder_contents import open_picture
+from .types import Photograph, fail, parsing
 
 S = TypeVar("S")
 T = TypeVar("T")

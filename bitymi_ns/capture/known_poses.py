@@ -9,18 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from bitymi_ns.capture.cache import content_key, emptied, made_once, replace_stale
-from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.find_files import check_photographs_exist
-from bitymi_ns.capture.image_files import from_header, image_size, read_image
-from bitymi_ns.capture.masks import write_colmap_masks
-from bitymi_ns.capture.points import Points
-from bitymi_ns.capture.sfm import process
-from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.sfm_photos import check_names, is_plain
-from bitymi_ns.capture.types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, fail, say, warn
 from bitymi_ns.files import Tell
 from bitymi_ns.progress import Progress, no_progress, rich_progress
+from .cache import content_key, emptied, made_once, replace_stale
+from .colmap_model import read_model
+from .find_files import check_photographs_exist
+from .image_files import from_header, image_size, read_image
+from .masks import write_colmap_masks
+from .points import Points
+from .sfm import process
+from .sfm.job import MODEL, CameraGroup, Job
+from .sfm_photos import check_names, is_plain
+from .types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, fail, say, warn
 
 FEW_POINTS = 10  # per photograph, below which little is known of the scene
 MIRROR = np.diag([1.0, 1.0, -1.0])

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say, scaled_size
 from bitymi_ns.trust import listed
+from .image_files import image_size, in_proportion, in_threads, wrong_size
+from .types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say, scaled_size
 
 MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
 NODE_STEP = 4  # pixels between the nodes of the distortion; interpolating between them is far more exact than a pixel

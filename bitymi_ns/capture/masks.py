@@ -9,13 +9,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.capture.cache import emptied
-from bitymi_ns.capture.folder_contents import is_picture, open_picture
-from bitymi_ns.capture.image_files import has_transparency, image_size, in_proportion, in_threads, wrong_size
-from bitymi_ns.capture.kinds import DYNAMIC, MASK, PHOTOGRAPHS
-from bitymi_ns.capture.sfm_photos import COPY
-from bitymi_ns.capture.types import Photograph, fail, parsing, say
 from bitymi_ns.trust import listed
+from .cache import emptied
+from .folder_contents import is_picture, open_picture
+from .image_files import has_transparency, image_size, in_proportion, in_threads, wrong_size
+from .kinds import DYNAMIC, MASK, PHOTOGRAPHS
+from .sfm_photos import COPY
+from .types import Photograph, fail, parsing, say
 
 LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"  # remedy in messages
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.sfm_report import FILES
-from bitymi_ns.capture.transforms import INTRINSICS
-from bitymi_ns.capture.types import FoundPoses
 from bitymi_ns.files import complete_folder, copy_files
 from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import Progress
 from bitymi_ns.trust import inside
+from . import pycolmap
+from .sfm_report import FILES
+from .transforms import INTRINSICS
+from .types import FoundPoses
 
 CLOUD = "sparse_pc.ply"
 

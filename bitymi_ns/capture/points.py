@@ -11,12 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from bitymi_ns.capture.folder_contents import kind_of
-from bitymi_ns.capture.image_files import WHITES, read_image, to_bytes
-from bitymi_ns.capture.kinds import CLOUDS
-from bitymi_ns.capture.types import CaptureError, Photograph, parsing, say
 from bitymi_ns.ply import read_header, read_rows
 from bitymi_ns.ranges import spread
+from .folder_contents import kind_of
+from .image_files import WHITES, read_image, to_bytes
+from .kinds import CLOUDS
+from .types import CaptureError, Photograph, parsing, say
 
 Array = npt.NDArray[np.float64]
 VERTEX = "vertex"

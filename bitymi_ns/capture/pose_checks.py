@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bitymi_ns.capture.types import FrameOptions, Photograph, fail, say, warn
 from bitymi_ns.trust import listed
+from .types import FrameOptions, Photograph, fail, say, warn
 
 EXACT = 1e-3  # error of rotations taken as they are: float32, or four written digits
 ROUNDED = 2e-2  # error of rounded rotations, up to a common factor: two written digits

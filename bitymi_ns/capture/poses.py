@@ -13,25 +13,25 @@ from pathlib import Path
 
 from pydantic import TypeAdapter
 
-from bitymi_ns.capture import pycolmap, sfm_photos, types
-from bitymi_ns.capture.cache import content_key, emptied, replace_stale, work_folder
-from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.folder_contents import passed_over, photo_folder, refusal, unreadable_in, videos_in
-from bitymi_ns.capture.frame import local_positions, move_to_world, write_frame
-from bitymi_ns.capture.kinds import FILM, VIDEOS
-from bitymi_ns.capture.masks import find_masks, mask_folder, write_colmap_masks
-from bitymi_ns.capture.recognise import is_model
-from bitymi_ns.capture.sfm import process
-from bitymi_ns.capture.sfm.job import MODEL, CameraGroup, Job
-from bitymi_ns.capture.sfm.model_checks import SHOOT
-from bitymi_ns.capture.sfm_photos import Photo
-from bitymi_ns.capture.sfm_report import write_report
-from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, FoundPoses, SfmOptions, fail, is_full_sphere
-from bitymi_ns.capture.video import NO_MOTION, extract_frames
 from bitymi_ns.files import Tell, complete_folder, write_errors_as, write_file
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import listed
+from . import pycolmap, sfm_photos, types
+from .cache import content_key, emptied, replace_stale, work_folder
+from .colmap_model import write_model
+from .folder_contents import passed_over, photo_folder, refusal, unreadable_in, videos_in
+from .frame import local_positions, move_to_world, write_frame
+from .kinds import FILM, VIDEOS
+from .masks import find_masks, mask_folder, write_colmap_masks
+from .recognise import is_model
+from .sfm import process
+from .sfm.job import MODEL, CameraGroup, Job
+from .sfm.model_checks import SHOOT
+from .sfm_photos import Photo
+from .sfm_report import write_report
+from .types import SPHERICAL_MODEL, ColmapCamera, FoundPoses, SfmOptions, fail, is_full_sphere
+from .video import NO_MOTION, extract_frames
 
 GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
 TELLING = 0.25  # least share of what looks like 360-degree pictures among photographs for all of them to be some

@@ -10,25 +10,25 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.colmap_views import TO_Z_UP, Source, find_source, model_points, photographs_of, warn_left_out
-from bitymi_ns.capture.find_files import check_photographs_exist, downscaled, name_unused
-from bitymi_ns.capture.folder_contents import photo_folder
-from bitymi_ns.capture.frame import read_frame
-from bitymi_ns.capture.image_files import check_sizes
-from bitymi_ns.capture.kinds import NSVF
-from bitymi_ns.capture.masks import check_masks, with_masks
-from bitymi_ns.capture.points import Points, cloud_beside, read_cloud, with_colors
-from bitymi_ns.capture.pose_checks import fit_scale
-from bitymi_ns.capture.readings import AUTO, WRITTEN, Reading, as_meant
-from bitymi_ns.capture.recognise import SPLITS, Format, Found, is_model, recognise
-from bitymi_ns.capture.scanner_views import Y_UP, scanner_photographs
-from bitymi_ns.capture.sfm_poses import find_sfm_source, kept_source, read_kept_poses
-from bitymi_ns.capture.splits import NameLists, SplitOptions, choose_split, lists_by_name, read_split_lists
-from bitymi_ns.capture.transforms import Transforms, check_number, read_transforms
-from bitymi_ns.capture.types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 from bitymi_ns.exit_messages import line_of
 from bitymi_ns.trust import listed
+from .colmap_model import read_model
+from .colmap_views import TO_Z_UP, Source, find_source, model_points, photographs_of, warn_left_out
+from .find_files import check_photographs_exist, downscaled, name_unused
+from .folder_contents import photo_folder
+from .frame import read_frame
+from .image_files import check_sizes
+from .kinds import NSVF
+from .masks import check_masks, with_masks
+from .points import Points, cloud_beside, read_cloud, with_colors
+from .pose_checks import fit_scale
+from .readings import AUTO, WRITTEN, Reading, as_meant
+from .recognise import SPLITS, Format, Found, is_model, recognise
+from .scanner_views import Y_UP, scanner_photographs
+from .sfm_poses import find_sfm_source, kept_source, read_kept_poses
+from .splits import NameLists, SplitOptions, choose_split, lists_by_name, read_split_lists
+from .transforms import Transforms, check_number, read_transforms
+from .types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 
 Choice = Literal["auto", "triangulate", "random"]  # auto = the capture's points, else triangulated ones
 WITH_MODEL = ("colmap", "photographs", "video")  # formats read as a COLMAP model
@@ -334,7 +334,7 @@ class _Reader:
             return own
         if not self.want_points:
             return None
-        from bitymi_ns.capture.known_poses import triangulated  # slow to import, and seldom needed
+        from .known_poses import triangulated  # slow to import, and seldom needed
 
         points = triangulated(photographs, folder, source)
         return (cloud_beside(folder, points, photographs, self._placed) if auto else None) or points

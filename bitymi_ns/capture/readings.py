@@ -15,14 +15,14 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.image_files import image_size, in_proportion, in_threads, read_image
-from bitymi_ns.capture.masks import checked_mask
-from bitymi_ns.capture.order import natural
-from bitymi_ns.capture.sfm.model_checks import rays_meet
-from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, CaptureError, ColmapCamera, Photograph, fail, warn
 from bitymi_ns.ranges import spread
 from bitymi_ns.trust import listed, told_apart
+from . import pycolmap
+from .image_files import image_size, in_proportion, in_threads, read_image
+from .masks import checked_mask
+from .order import natural
+from .sfm.model_checks import rays_meet
+from .types import OPENCV_AXES, SPHERICAL_MODEL, CaptureError, ColmapCamera, Photograph, fail, warn
 
 Array = npt.NDArray[np.float64]
 Features = tuple[Array, npt.NDArray[np.float32]]

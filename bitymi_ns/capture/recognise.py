@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from bitymi_ns.capture import folder_contents
-from bitymi_ns.capture.kinds import OTHERS, PHOTOGRAPHS, SCANS, UNREAD, VIDEOS
-from bitymi_ns.capture.types import fail
 from bitymi_ns.safe_reading import MOST_TEXT, open_regular, open_text, read_json
 from bitymi_ns.trust import listed
+from . import folder_contents
+from .kinds import OTHERS, PHOTOGRAPHS, SCANS, UNREAD, VIDEOS
+from .types import fail
 
 Format = Literal[
     "nerfstudio", "instant-ngp", "blender", "colmap", "polycam", "record3d", "3d-scanner", "stray-scanner",

@@ -9,17 +9,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture.depth_normal_maps import MapFiles, maps_beside, maps_called
-from bitymi_ns.capture.folder_contents import photographs_in
-from bitymi_ns.capture.image_files import image_size, in_proportion, wrong_size
-from bitymi_ns.capture.order import natural
-from bitymi_ns.capture.pose_checks import rotations
-from bitymi_ns.capture.recognise import POLYCAM, STRAY, Found
-from bitymi_ns.capture.transforms import MAX_SIDE
-from bitymi_ns.capture.types import OPENCV_AXES, ColmapCamera, Photograph, Pose, fail, parsing, warn
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.safe_reading import read_json, read_text
 from bitymi_ns.trust import listed
+from .depth_normal_maps import MapFiles, maps_beside, maps_called
+from .folder_contents import photographs_in
+from .image_files import image_size, in_proportion, wrong_size
+from .order import natural
+from .pose_checks import rotations
+from .recognise import POLYCAM, STRAY, Found
+from .transforms import MAX_SIDE
+from .types import OPENCV_AXES, ColmapCamera, Photograph, Pose, fail, parsing, warn
 
 
 class ScannedPhotograph(NamedTuple):
@@ -119,7 +119,7 @@ def _scanner_app(folder: Path) -> list[ScannedPhotograph]:
 
 def _stray_scanner(folder: Path) -> list[ScannedPhotograph]:
     """Read Stray Scanner's camera matrix, video and poses: positions and quaternions xyzw, with OpenCV axes."""
-    from bitymi_ns.capture.video import frames_with_poses  # slow to import
+    from .video import frames_with_poses  # slow to import
 
     odometry, matrix, video = (folder / name for name in STRAY)
     with parsing(matrix, AGAIN):

@@ -15,15 +15,15 @@ import numpy as np
 import numpy.typing as npt
 from PIL import ExifTags, Image, ImageOps
 
-from bitymi_ns.capture.exif import Exif, exposure_exif, read_exif
-from bitymi_ns.capture.folder_contents import open_picture, photographs_below
-from bitymi_ns.capture.image_files import eight_bits, in_srgb
-from bitymi_ns.capture.order import natural
-from bitymi_ns.capture.types import CaptureError, fail, is_full_sphere, scaled_size
 from bitymi_ns.files import complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.safe_reading import open_regular, why
 from bitymi_ns.trust import is_text, listed
+from .exif import Exif, exposure_exif, read_exif
+from .folder_contents import open_picture, photographs_below
+from .image_files import eight_bits, in_srgb
+from .order import natural
+from .types import CaptureError, fail, is_full_sphere, scaled_size
 
 PLAIN = {
     "JPEG": (".jpg", ".jpeg"), "PNG": (".png",), "BMP": (".bmp",), "TIFF": (".tif", ".tiff"),

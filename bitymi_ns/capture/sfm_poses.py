@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 from pydantic import TypeAdapter
 
-from bitymi_ns.capture.cache import keep_work_folder
-from bitymi_ns.capture.colmap_model import read_model
-from bitymi_ns.capture.colmap_views import Origin, Source
-from bitymi_ns.capture.frame import gps_line
-from bitymi_ns.capture.image_files import image_size, in_threads
-from bitymi_ns.capture.recognise import Found
-from bitymi_ns.capture.types import SfmOptions, SfmSettings, fail, parsing, say, warn
 from bitymi_ns.files import copy_files
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import Refused, leads_inside, listed
+from .cache import keep_work_folder
+from .colmap_model import read_model
+from .colmap_views import Origin, Source
+from .frame import gps_line
+from .image_files import image_size, in_threads
+from .recognise import Found
+from .types import SfmOptions, SfmSettings, fail, parsing, say, warn
 
 MODEL = Path("sparse/0")
 IMAGES = "images"
@@ -42,8 +42,8 @@ class KeptPoses(NamedTuple):
 def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings, use_masks: bool = True) -> Source:
     """Run structure from motion on photographs or a video, or find an earlier run's model. `masks_path` is relative to
     the capture, None = find it. Raises CaptureError: no poses can be found; says what to photograph differently."""
-    from bitymi_ns.capture.poses import find_poses  # slow to import
     from bitymi_ns.progress import rich_progress
+    from .poses import find_poses  # slow to import
 
     masks = None if masks_path is None else found.folder / masks_path
     with rich_progress() as progress:

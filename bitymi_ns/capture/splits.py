@@ -9,12 +9,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from bitymi_ns.capture.find_files import find_named
-from bitymi_ns.capture.folder_contents import kind_of
-from bitymi_ns.capture.kinds import LISTS, PROCESSED, Kind
-from bitymi_ns.capture.types import Photograph, fail, parsing, warn
 from bitymi_ns.safe_reading import read_text
 from bitymi_ns.trust import listed, told_apart
+from .find_files import find_named
+from .folder_contents import kind_of
+from .kinds import LISTS, PROCESSED, Kind
+from .types import Photograph, fail, parsing, warn
 
 Mode = Literal["fraction", "filename", "interval", "all"]
 

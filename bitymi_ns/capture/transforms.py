@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from bitymi_ns.capture import find_files
-from bitymi_ns.capture.image_files import image_size
-from bitymi_ns.capture.lens import colmap_distortion
-from bitymi_ns.capture.pose_checks import as_matrix, correct_poses
-from bitymi_ns.capture.splits import NameLists
-from bitymi_ns.capture.types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say
 from bitymi_ns.safe_reading import read_json
 from bitymi_ns.trust import listed
+from . import find_files
+from .image_files import image_size
+from .lens import colmap_distortion
+from .pose_checks import as_matrix, correct_poses
+from .splits import NameLists
+from .types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, parsing, say
 
 HOW_TO_GET_ONE = "Give a folder of photographs or a video: their poses are found."
 HOW_TO_CORRECT = "Correct it there (JSON has neither comments nor a comma behind the last entry), or write it again."

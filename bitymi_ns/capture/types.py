@@ -82,7 +82,7 @@ class ColmapCamera(NamedTuple):
 
     @property
     def colmap(self) -> "pycolmap.Camera":
-        from bitymi_ns.capture import pycolmap  # slow, and not needed for options
+        from . import pycolmap  # slow, and not needed for options
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 

@@ -13,12 +13,12 @@ import numpy.typing as npt
 from av.container import InputContainer
 from PIL import Image, ImageOps
 
-from bitymi_ns.capture.cache import content_key, made_once
-from bitymi_ns.capture.sfm_photos import IMAGES, JPEG_QUALITY, sharpness
-from bitymi_ns.capture.types import fail, warn
 from bitymi_ns.files import Tell, complete_folder
 from bitymi_ns.progress import Progress
 from bitymi_ns.safe_reading import open_regular
+from .cache import content_key, made_once
+from .sfm_photos import IMAGES, JPEG_QUALITY, sharpness
+from .types import fail, warn
 
 SMALL = 160  # longer side of frames for measuring motion, pixels
 FINE = 640  # longer side of frames for measuring sharpness, pixels

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bitymi_ns.codec.packing import Packing
 from bitymi_ns.ops import TexelAlpha, TexelTiles
 from bitymi_ns.ops.baked_scene import alpha_means
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
+from .packing import Packing
 
 
 def joined(colors: Tensor, alphas: Tensor | None) -> Tensor:

@@ -11,12 +11,12 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.codec.bc7_encode import STRIP, Profile, bc7_encoder
-from bitymi_ns.codec.limits import ALPHA_LIMIT, ALPHA_ONE, ALPHA_SCALE, RESIDUAL_LIMIT
-from bitymi_ns.codec.packing import Packing
-from bitymi_ns.codec.pages import covered_blocks, paged_texels
 from bitymi_ns.ops.baked_scene import decode_bc7
 from bitymi_ns.progress import Progress, no_progress
+from .bc7_encode import STRIP, Profile, bc7_encoder
+from .limits import ALPHA_LIMIT, ALPHA_ONE, ALPHA_SCALE, RESIDUAL_LIMIT
+from .packing import Packing
+from .pages import covered_blocks, paged_texels
 
 Format = Literal["bc7", "uint8", "fp16"]
 RangeRule = Literal["sigma6", "minmax", "auto"]

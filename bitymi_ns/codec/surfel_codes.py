@@ -8,11 +8,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from bitymi_ns.codec import streams
-from bitymi_ns.codec.limits import EXTENTS, limit_of
 from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS, SMALLEST_SHARE, Parameter
 from bitymi_ns.ops.view_color import LEAN
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
+from . import streams
+from .limits import EXTENTS, limit_of
 
 Codes = npt.NDArray[np.int64]
 

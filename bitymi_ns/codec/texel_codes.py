@@ -13,11 +13,11 @@ import torch
 from scipy.fft import dct
 from torch import Tensor
 
-from bitymi_ns.codec import streams
-from bitymi_ns.codec.limits import ALPHA_ONE, RESIDUAL_LIMIT
-from bitymi_ns.codec.pages import first_texels, joined, size_classes
-from bitymi_ns.codec.surfel_codes import SurfelCodes, from_differences, quantised, to_differences
 from bitymi_ns.ops import backend
+from . import streams
+from .limits import ALPHA_ONE, RESIDUAL_LIMIT
+from .pages import first_texels, joined, size_classes
+from .surfel_codes import SurfelCodes, from_differences, quantised, to_differences
 
 BLOCK = 8  # largest side of a transformed block, texels
 GRADES = (-8, 24)  # range of a tile's grade: its step is the common one times 2^(grade / 2)

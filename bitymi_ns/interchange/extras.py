@@ -13,18 +13,18 @@ from bitymi_ns.bake.view_colors import centers_of
 from bitymi_ns.bundle import Bundle, BundleError
 from bitymi_ns.codec.pages import texel_alpha
 from bitymi_ns.files import complete_folder, reserved, write_errors_as
-from bitymi_ns.interchange.frame import to_capture, up_of
-from bitymi_ns.interchange.gaussians import Gaussians, gaussians_of, write_gaussians
-from bitymi_ns.interchange.glb import quads_glb, upright
-from bitymi_ns.interchange.quads import quads_of
-from bitymi_ns.interchange.recolor import recolored
-from bitymi_ns.interchange.surfel_colors import fit_colors, weighted_residuals
-from bitymi_ns.interchange.usd import check_usd, write_usd
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import visibility
 from bitymi_ns.trust import check_replaceable
+from .frame import to_capture, up_of
+from .gaussians import Gaussians, gaussians_of, write_gaussians
+from .glb import quads_glb, upright
+from .quads import quads_of
+from .recolor import recolored
+from .surfel_colors import fit_colors, weighted_residuals
+from .usd import check_usd, write_usd
 
 Kind = Literal["gaussians", "surfels", "usd", "mesh"]
 Frame = Literal["scene", "capture"]

@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ply
-from bitymi_ns.interchange import harmonics
-from bitymi_ns.interchange.frame import Similarity
-from bitymi_ns.interchange.quads import fetch_texels
 from bitymi_ns.ops.constants import ALPHA_MAX, SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.train.init import rotate_in_plane, tangents
+from . import harmonics
+from .frame import Similarity
+from .quads import fetch_texels
 
 FLAT_LOG_SCALE = -16.0
 """Log of the Gaussians' third scale, in the scene's frame, whose cameras lie within a unit of the origin."""

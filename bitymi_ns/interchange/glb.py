@@ -11,8 +11,8 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from bitymi_ns.interchange.quads import MASK, Quads
-from bitymi_ns.interchange.triangles import Triangles
+from .quads import MASK, Quads
+from .triangles import Triangles
 
 _LINEAR, _CLAMP = 9729, 33071
 _FACES = ((0, 1, 2), (0, 2, 3))

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.interchange.quads import MASK, Quads, bilinear
 from bitymi_ns.scene.camera import Camera
+from .quads import MASK, Quads, bilinear
 
 _AT_ONCE = 1 << 19  # pairs of quads and pixels per batch
 

@@ -10,11 +10,11 @@ from torch import Tensor
 
 from bitymi_ns.codec.packing import GRID, pack
 from bitymi_ns.codec.pages import size_classes, texel_alpha, texel_index
-from bitymi_ns.interchange.frame import Similarity
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters, next_power_of_two
 from bitymi_ns.train.init import tangents
+from .frame import Similarity
 
 MASK = 0.5  # alpha cutoff
 _CORNERS = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))

@@ -7,10 +7,10 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.codec.pages import size_classes, texel_index
-from bitymi_ns.interchange.quad_hits import nearest_hits
-from bitymi_ns.interchange.quads import Quads
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
+from .quad_hits import nearest_hits
+from .quads import Quads
 
 PRIOR = 1.0  # weight of the previous colour, in pixels
 

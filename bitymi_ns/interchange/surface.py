@@ -12,13 +12,13 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from bitymi_ns.interchange.frame import Similarity
-from bitymi_ns.interchange.triangles import Triangles, cleaned, solid
 from bitymi_ns.ops import TexelAlpha, fitting_lists, project
 from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
+from .frame import Similarity
+from .triangles import Triangles, cleaned, solid
 
 if TYPE_CHECKING:
     import open3d

@@ -8,8 +8,8 @@ import trimesh
 from torch import Tensor
 from trimesh.exchange.ply import export_ply
 
-from bitymi_ns.interchange.glb import surface_glb, upright
-from bitymi_ns.interchange.triangles import Triangles
+from .glb import surface_glb, upright
+from .triangles import Triangles
 
 MeshFormat = Literal["ply", "glb", "obj"]
 

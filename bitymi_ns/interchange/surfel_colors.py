@@ -10,11 +10,11 @@ from bitymi_ns.bake.directions import view_directions
 from bitymi_ns.bake.tiles import texel_centers
 from bitymi_ns.bake.view_colors import shown_at
 from bitymi_ns.codec.pages import size_classes, texel_index
-from bitymi_ns.interchange import harmonics
 from bitymi_ns.ops.constants import COLOR_BIAS, SUPPORT
 from bitymi_ns.ops.view_kinds import fibonacci_sphere
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.tile_sizes import kernel_parameters
+from . import harmonics
 
 OUTSIDE, OUTSIDE_WEIGHT = 32, 0.1
 """Number of directions over the whole sphere, and their total weight relative to the viewing directions'."""

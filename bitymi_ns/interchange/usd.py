@@ -9,7 +9,7 @@ import numpy as np
 from torch import Tensor
 
 from bitymi_ns.bundle.manifest import BundleError
-from bitymi_ns.interchange.gaussians import Gaussians
+from .gaussians import Gaussians
 
 
 def check_usd() -> None:

@@ -12,7 +12,6 @@ from collections.abc import Iterator
 import torch
 
 from bitymi_ns.capture.cache import user_cache
-from bitymi_ns.measure.machine import machine, output
 from bitymi_ns.ops import backend
 from bitymi_ns.safe_reading import why
 from bitymi_ns.scene.camera import Camera
@@ -20,6 +19,7 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.init import scene_for_views
 from bitymi_ns.train.preset import load_preset
 from bitymi_ns.train.views import View
+from .machine import machine, output
 
 PACKAGES = (
     "bitymi-ns", "torch", "torchvision", "nerfstudio", "gsplat", "numpy", "opencv-python-headless", "opencv-python",

@@ -12,8 +12,8 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from bitymi_ns.files import write_errors_as, write_file
-from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.trust import printable
+from .machine import commit, machine, versions
 
 
 def escaped(text: str) -> str:

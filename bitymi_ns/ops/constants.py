@@ -6,7 +6,6 @@ The float64 twins in `ops.reference` state those of the formulas again, as an in
 from typing import Any
 
 from bitymi_ns.errors import KernelsUnavailable
-
 from .backend import load
 
 

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.exit_messages import out_of_memory
-
 from .backend import Pool, function, kernel, kernel_class, module
 from .capacity import TooManyFragments
 from .fragment_list import Layout, empty_ids, empty_list

@@ -19,14 +19,14 @@ from rich.errors import MarkupError
 from bitymi_ns import exit_messages
 from bitymi_ns.bundle.manifest import MANIFEST
 from bitymi_ns.bundle.parts import CONFIG, bundle_at
-from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.datamanager import BitymiDataManager
-from bitymi_ns.plugin.data.dataparser import BundleCamerasConfig, has_cameras
-from bitymi_ns.plugin.data.views import DATA
-from bitymi_ns.plugin.run import checkpoints, render
-from bitymi_ns.plugin.run.bundle_model import BakedModelConfig, check_same_capture
-from bitymi_ns.plugin.run.films import WholeText, open_gzip, write_image
-from bitymi_ns.plugin.run.surfel_model import SurfelModel
+from .console import fail
+from .data.datamanager import BitymiDataManager
+from .data.dataparser import BundleCamerasConfig, has_cameras
+from .data.views import DATA
+from .run import checkpoints, render
+from .run.bundle_model import BakedModelConfig, check_same_capture
+from .run.films import WholeText, open_gzip, write_image
+from .run.surfel_model import SurfelModel
 
 _MESH = (
     "`ns-export bitymi-mesh` writes the surface, a mesh whose vertices are points with colors; `bitymi extras BUNDLE` "

@@ -26,7 +26,7 @@ class UnavailableConfig(TrainerConfig):
 @functools.cache
 def _specification(name: str) -> MethodSpecification:
     try:
-        from bitymi_ns.plugin.run.config import method_config
+        from .run.config import method_config
 
         return method_config(name)
     except Exception as error:  # noqa: BLE001 - see the module's docstring
@@ -39,8 +39,8 @@ def _specification(name: str) -> MethodSpecification:
 def _install() -> None:
     """Make the changes that nerfstudio's registry has no place for, each even if another fails; see `hooks`."""
     try:
-        from bitymi_ns.plugin import hooks
-        from bitymi_ns.plugin.run import torchrun
+        from . import hooks
+        from .run import torchrun
     except Exception as error:  # noqa: BLE001 - see the module's docstring
         _warn("`ns-export bitymi-atlas` is not available", error)
         return
@@ -63,9 +63,9 @@ def _warn(lost: str, error: Exception) -> None:
 def _exports() -> list[Any]:
     import tyro
 
-    from bitymi_ns.plugin.export.command import ExportAtlas
-    from bitymi_ns.plugin.export.mesh import ExportMesh
-    from bitymi_ns.plugin.hooks import COMMAND, MESH_COMMAND
+    from .export.command import ExportAtlas
+    from .export.mesh import ExportMesh
+    from .hooks import COMMAND, MESH_COMMAND
 
     atlas = "Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest."
     mesh = "Extract the surface of a trained bitymi scene or of a bundle as a triangle mesh with vertex colors."

@@ -1,5 +1,5 @@
 """A small ray-traced room with exact cameras, written as a nerfstudio capture: the demo and end-to-end test scene."""
 
-from bitymi_ns.sample.capture import generate
+from .capture import generate
 
 __all__ = ["generate"]

@@ -17,8 +17,8 @@ from bitymi_ns.files import complete_folder
 from bitymi_ns.ply import write_cloud
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.safe_reading import read_json
-from bitymi_ns.sample.room import Room
 from bitymi_ns.trust import check_replaceable
+from .room import Room
 
 FOCAL = 0.80  # focal length in image widths
 TARGET = np.array([0.0, 0.0, 0.72])

@@ -8,8 +8,8 @@ from functools import partial
 
 import numpy as np
 
-from bitymi_ns.sample import textures
-from bitymi_ns.sample.textures import Image
+from . import textures
+from .textures import Image
 
 LOW = np.array([[-3.0], [-2.5], [0.0]], np.float32)
 HIGH = np.array([[3.0], [2.5], [2.6]], np.float32)

@@ -13,7 +13,6 @@ from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.baked import DrawCache, common_size, draw, packed
 from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.constants import TRANSMITTANCE_MIN
-
 from .camera import Camera
 from .sampling import TWO_SAMPLES, Sampling, averaged, padded, part_of, sampling_of, size_of
 

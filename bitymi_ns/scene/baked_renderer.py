@@ -9,7 +9,6 @@ from torch import Tensor
 
 from bitymi_ns.ops.backend import cuda_backend, on_device
 from bitymi_ns.ops.baked_cuda import Stage, Workspace, compiled, empty_images, frame, stack_cameras
-
 from .baked import OUTPUTS, BakedOutput, BakedScene, image_names
 from .camera import Camera
 from .sampling import Sampling

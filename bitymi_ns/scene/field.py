@@ -12,7 +12,6 @@ from bitymi_ns.ops import Fragments, TexelAlpha, TexelDescent, TexelTiles, fragm
 from bitymi_ns.ops.backend import version_of
 from bitymi_ns.ops.constants import FEATURES, WIDTH
 from bitymi_ns.ops.field import FieldGeometry, field
-
 from .config import SceneConfig
 
 T = TypeVar("T")

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.constants import SUPPORT
-
 from .camera import Camera
 
 AS_TRAINED = (0.75, 1.5)

@@ -29,7 +29,6 @@ from bitymi_ns.ops.capacity import memory_errors
 from bitymi_ns.ops.parameters import GEOMETRY, Tensors
 from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.ops.training_view import ComparedView, PhotographTarget, training_view
-
 from .camera import Camera
 from .config import SceneConfig
 from .field import HashField, TexelField

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.constants import ALPHA_MAX, BETA_MAX, SUPPORT
-
 from .camera import Camera
 
 MARGIN = 1.5

@@ -13,10 +13,10 @@ from bitymi_ns.ops import TexelAlpha, project, surfel_coverage
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.progress import Progress, no_progress
-from bitymi_ns.scene.camera import Camera
+from .camera import Camera
 
 if TYPE_CHECKING:
-    from bitymi_ns.scene.scene import Scene
+    from .scene import Scene
 
 SAMPLE = 4096  # random surfels whose visibility is tested first: nearly all views see one of them
 CHUNK = 1 << 20  # surfels tested at a time after that

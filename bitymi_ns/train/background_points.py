@@ -12,7 +12,7 @@ from torch import Tensor
 
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.views import View, as_float, downscale_image, downscale_mask
+from .views import View, as_float, downscale_image, downscale_mask
 
 CELLS = 24  # maximum number of cells along the longer side of a photograph
 POINTS_PER_CELL = 4  # minimum average of points per cell: with fewer, cells may be empty by chance

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.exposure import Exposure
-from bitymi_ns.train.losses import fitted_psnr, mean_psnr, psnr
-from bitymi_ns.train.poses import Poses, aligned, view_psnr
-from bitymi_ns.train.views import View, eval_background
+from .config import TrainConfig
+from .exposure import Exposure
+from .losses import fitted_psnr, mean_psnr, psnr
+from .poses import Poses, aligned, view_psnr
+from .views import View, eval_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from bitymi_ns.capture.order import Neighbours
 from bitymi_ns.ops.backend import dense, kernel
-from bitymi_ns.train.config import ExposureKind
-from bitymi_ns.train.gains import estimate_gains
-from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.views import OnDemand, View
+from .config import ExposureKind
+from .gains import estimate_gains
+from .processes import ALONE, Processes
+from .views import OnDemand, View
 
 LIMIT = 2.0  # largest log gain: 7.4 times as bright, about 6 stops in gamma-encoded colours
 OTHER_LIMIT = 0.5  # largest other entry of an affine correction

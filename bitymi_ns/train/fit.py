@@ -11,13 +11,13 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.evaluate import Quality, evaluate
-from bitymi_ns.train.init import scene_extent
-from bitymi_ns.train.optimizers import forget_gradients, make_optimizers, step
-from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.step import Training
-from bitymi_ns.train.views import TrainingData, View, covered_fraction, training_order
+from .config import TrainConfig
+from .evaluate import Quality, evaluate
+from .init import scene_extent
+from .optimizers import forget_gradients, make_optimizers, step
+from .processes import ALONE, Processes
+from .step import Training
+from .views import TrainingData, View, covered_fraction, training_order
 
 if TYPE_CHECKING:
     from bitymi_ns.ops.training_view import ComparedView

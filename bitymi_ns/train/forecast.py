@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from bitymi_ns.train.schedules import Schedule
+    from .schedules import Schedule
 
 Steps = npt.NDArray[np.float64]
 """A number for each step of a run."""

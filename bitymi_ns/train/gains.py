@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.views import View, as_float
+from .views import View, as_float
 
 POINTS = 6000  # maximum number of points compared
 HIDING = 100_000  # maximum number of points that may occlude them

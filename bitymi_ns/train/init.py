@@ -15,9 +15,9 @@ from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
 from bitymi_ns.scene.scene import NEAR, Scene
-from bitymi_ns.train.background_points import BackgroundPoints, background_points
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.views import View
+from .background_points import BackgroundPoints, background_points
+from .config import TrainConfig
+from .views import View
 
 MAX_SCALE = 0.25
 """Largest initial scale, as a fraction of the larger of scene extent and distance to the nearest camera."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.training_view import ComparedView
-from bitymi_ns.train.config import LossConfig
+from .config import LossConfig
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput

@@ -7,7 +7,7 @@ import torch
 
 from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.ops.capacity import free_memory
-from bitymi_ns.train.processes import Processes
+from .processes import Processes
 
 FILLED = 0.75
 """Fraction of the memory beyond which nothing grows. Copies while surfels are replaced, freed blocks that are kept for

@@ -8,10 +8,10 @@ from dataclasses import asdict
 from typing import Any
 
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
-from bitymi_ns.train.init import PointReport, default_table_size, table_size_of
-from bitymi_ns.train.memory import FILLED
-from bitymi_ns.train.schedules import Schedule
+from .config import REFERENCE_STEPS, TrainConfig
+from .init import PointReport, default_table_size, table_size_of
+from .memory import FILLED
+from .schedules import Schedule
 
 
 def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int = 1) -> list[str]:

@@ -26,14 +26,14 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.losses import photometric, psnr
+from .losses import photometric, psnr
 
 if TYPE_CHECKING:
     from bitymi_ns.ops import Projection
     from bitymi_ns.scene.scene import Scene
-    from bitymi_ns.train.processes import Processes
-    from bitymi_ns.train.schedules import Schedule
-    from bitymi_ns.train.views import View
+    from .processes import Processes
+    from .schedules import Schedule
+    from .views import View
 
 DAMPING = 0.01  # added to the curvature's diagonal, relative to it
 NEIGHBOURS = 4  # photographs whose corrections are averaged for another camera

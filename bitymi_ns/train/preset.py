@@ -15,7 +15,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.config import SceneConfig
-from bitymi_ns.train.config import TrainConfig
+from .config import TrainConfig
 
 
 class PresetError(ValueError):

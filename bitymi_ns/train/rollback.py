@@ -17,13 +17,13 @@ from torch import Tensor
 
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
-from bitymi_ns.train.exposure import Exposure
-from bitymi_ns.train.losses import photometric
-from bitymi_ns.train.optimizers import replace_rows
-from bitymi_ns.train.poses import Poses
-from bitymi_ns.train.strategy import Strategy, finite_rows
-from bitymi_ns.train.views import DownscaledViews, step_background
+from .divergence import TrainingDiverged, describe_broken
+from .exposure import Exposure
+from .losses import photometric
+from .optimizers import replace_rows
+from .poses import Poses
+from .strategy import Strategy, finite_rows
+from .views import DownscaledViews, step_background
 
 WORSE = 1.25  # ratio to the loss of blank images or of the initial scene above which an early window is bad; later 1
 EARLY, EARLY_STEPS = 0.1, 100  # fraction of the run, and minimum number of steps, in which surfels settle

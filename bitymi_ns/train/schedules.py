@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from bitymi_ns.ops.view_kinds import PARAMETERS
 from bitymi_ns.ranges import check_ranges
-from bitymi_ns.train.config import REFERENCE_STEPS, TrainConfig
+from .config import REFERENCE_STEPS, TrainConfig
 
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
 """Number of views on which the error prune measures removals, as a fraction of the run's steps, and its minimum."""

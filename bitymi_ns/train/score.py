@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.losses import photometric
-from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.views import View, eval_background, step_background
+from .config import TrainConfig
+from .losses import photometric
+from .processes import ALONE, Processes
+from .views import View, eval_background, step_background
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene

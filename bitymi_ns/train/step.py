@@ -20,20 +20,20 @@ from bitymi_ns.ops.training_view import ComparedView, PhotographTarget
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.scene import RenderOutput
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.divergence import LossWatch, TrainingDiverged
-from bitymi_ns.train.exposure import Exposure
-from bitymi_ns.train.losses import fused_losses, objective
-from bitymi_ns.train.messages import memory_reached
-from bitymi_ns.train.optimizers import ResizeHook, set_rate
-from bitymi_ns.train.poses import Poses
-from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.rollback import RollbackGuard
-from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.step_sizes import StepSizes
-from bitymi_ns.train.strategy import Strategy
-from bitymi_ns.train.texels import LearningTexels
-from bitymi_ns.train.views import (
+from .config import TrainConfig
+from .divergence import LossWatch, TrainingDiverged
+from .exposure import Exposure
+from .losses import fused_losses, objective
+from .messages import memory_reached
+from .optimizers import ResizeHook, set_rate
+from .poses import Poses
+from .processes import ALONE, Processes
+from .rollback import RollbackGuard
+from .schedules import Schedule
+from .step_sizes import StepSizes
+from .strategy import Strategy
+from .texels import LearningTexels
+from .views import (
     DownscaledViews,
     TrainingData,
     View,

@@ -13,7 +13,7 @@ from bitymi_ns.scene.camera import Camera
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
-    from bitymi_ns.train.schedules import Schedule
+    from .schedules import Schedule
 
 MEASURED = 64  # maximum number of training views to measure footprints in, evenly spaced
 

@@ -26,16 +26,16 @@ from bitymi_ns.ops.backend import cuda_backend, dense, kernel
 from bitymi_ns.ops.constants import ALPHA_MIN
 from bitymi_ns.ops.parameters import Tensors
 from bitymi_ns.scene.field import TexelField
-from bitymi_ns.train.config import TrainConfig
-from bitymi_ns.train.divergence import TrainingDiverged, describe_broken
-from bitymi_ns.train.init import tangents
-from bitymi_ns.train.memory import PER_SURFEL, PER_TEXEL, room_to_grow, view_bytes
-from bitymi_ns.train.optimizers import ResizeHook, cap_opacity, replace_rows
-from bitymi_ns.train.processes import ALONE, Processes
-from bitymi_ns.train.schedules import Schedule
-from bitymi_ns.train.score import multi_view_scores, removal_errors
-from bitymi_ns.train.texels import SMALLEST
-from bitymi_ns.train.views import View
+from .config import TrainConfig
+from .divergence import TrainingDiverged, describe_broken
+from .init import tangents
+from .memory import PER_SURFEL, PER_TEXEL, room_to_grow, view_bytes
+from .optimizers import ResizeHook, cap_opacity, replace_rows
+from .processes import ALONE, Processes
+from .schedules import Schedule
+from .score import multi_view_scores, removal_errors
+from .texels import SMALLEST
+from .views import View
 
 if TYPE_CHECKING:
     from bitymi_ns.ops.project import Projection

@@ -21,17 +21,17 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.tile_sizes import coarsened, kernel_parameters, max_projected_extent, seen_sides, visible_extent
 from bitymi_ns.scene.visibility import Visibility, visibility
-from bitymi_ns.train.init import tangents
-from bitymi_ns.train.losses import count_values
-from bitymi_ns.train.memory import PER_TEXEL, PER_TEXEL_SUM, room_to_grow
-from bitymi_ns.train.processes import Processes
-from bitymi_ns.train.views import OnDemand, at_size
+from .init import tangents
+from .losses import count_values
+from .memory import PER_TEXEL, PER_TEXEL_SUM, room_to_grow
+from .processes import Processes
+from .views import OnDemand, at_size
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
-    from bitymi_ns.train.config import TexelConfig
-    from bitymi_ns.train.schedules import Schedule
-    from bitymi_ns.train.views import DownscaledViews, View
+    from .config import TexelConfig
+    from .schedules import Schedule
+    from .views import DownscaledViews, View
 
 SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
 FEW = 1 << 23  # total number of texels that runs of any length may have: 370 MB

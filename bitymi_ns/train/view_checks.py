@@ -6,7 +6,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from bitymi_ns.train.views import View
+from .views import View
 
 _ROUNDING = 1e-3  # by which resampled images may lie outside of 0 to 1
 

@@ -14,7 +14,7 @@ from torch.nn.functional import interpolate
 
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.train.config import TrainConfig
+from .config import TrainConfig
 
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene

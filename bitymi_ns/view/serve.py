@@ -15,7 +15,6 @@ from typing import Any
 from urllib.parse import unquote, urlsplit
 
 from bitymi_ns.bundle.manifest import BundleError
-
 from .page import PageError, Site, media_type
 
 LOOPBACK = "127.0.0.1"

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.sfm import matching, model_checks
-from bitymi_ns.capture.sfm.job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
-from bitymi_ns.capture.sfm.model_checks import contradicted, drop_unlinked
 from bitymi_ns.capture.types import CONTRADICTED
+from . import matching, model_checks
+from .job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
+from .model_checks import contradicted, drop_unlinked
 
 Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
 """Function that maps a database's features and matches, given a folder for files; returns connected components."""

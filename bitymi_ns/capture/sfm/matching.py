@@ -8,9 +8,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.sfm.job import PAIRS, CameraGroup, Job, StageProgress
 from bitymi_ns.capture.types import SPHERICAL_MODEL
 from bitymi_ns.files import write_file
+from .job import PAIRS, CameraGroup, Job, StageProgress
 
 SMALL = 1000  # photographs with a shorter longer side, pixels, are doubled; larger ones have enough features
 SPHERICAL_SCALE = 2

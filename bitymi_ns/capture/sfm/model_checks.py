@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.sfm.job import MAX_ERROR, CameraGroup, Job, NoPoses
+from .job import MAX_ERROR, CameraGroup, Job, NoPoses
 
 LINK = 15  # points seen together that link two photographs; COLMAP's least number of inliers of a pair
 FEW_FEATURES = 60  # features of a photograph with hardly any detail

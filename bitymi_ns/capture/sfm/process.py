@@ -12,11 +12,11 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.capture.sfm.job import DATABASE, PAIRS, Job
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import size_text
 from bitymi_ns.progress import Progress
 from bitymi_ns.trust import no_links, python_command
+from .job import DATABASE, PAIRS, Job
 
 LOG = "colmap.log"
 LITTLE_SPACE = 50_000_000  # free bytes below which a failure counts as a full disk

@@ -15,9 +15,9 @@ import numpy as np
 import pycolmap  # in this process with its signal handlers, which write the stack of a crash to the log
 
 from bitymi_ns.capture.colmap_model import write_model
-from bitymi_ns.capture.sfm import mapping, matching, model_checks
-from bitymi_ns.capture.sfm.job import DATABASE, MODEL, Job, NoPoses
 from bitymi_ns.files import complete_folder, write_errors_as
+from . import mapping, matching, model_checks
+from .job import DATABASE, MODEL, Job, NoPoses
 
 LEAST = 3  # placed photographs of a capture
 _messages = sys.__stdout__  # the pipe of messages

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.files import write_errors_as
-from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.safe_reading import read_bytes
 from bitymi_ns.trust import json_of, no_links
+from .process import BenchError
 
 FILE = "cells.jsonl"
 NAMES = ("suite", "row")  # entries of a key that are labels, not part of its identity

@@ -10,15 +10,15 @@ from typing import get_args
 import tyro
 
 from bitymi_ns.files import check_writable, write_errors_as
-from bitymi_ns.measure.bench.cells import FILE, Cells
-from bitymi_ns.measure.bench.engine import run_chains
-from bitymi_ns.measure.bench.matrix import Chain, Format, Plan, Row, chains, local_scenes, read_plan, standard_scenes
-from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.markdown import page, publish
 from bitymi_ns.measure.report.read import add_cells
 from bitymi_ns.measure.report.records import Records
 from bitymi_ns.measure.report.tables import NOTES, quality_markdown
 from bitymi_ns.trust import printable
+from .cells import FILE, Cells
+from .engine import run_chains
+from .matrix import Chain, Format, Plan, Row, chains, local_scenes, read_plan, standard_scenes
+from .process import BenchError, say
 
 FAILED, INTERRUPTED = 1, 130  # exit statuses after a failed cell and after Ctrl-C
 

@@ -9,11 +9,11 @@ from typing import Any, NoReturn
 
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.locks import Busy, Lock
-from bitymi_ns.measure.bench.cells import FILE, Cells, provenance
-from bitymi_ns.measure.bench.matrix import Cell, Chain
-from bitymi_ns.measure.bench.process import BenchError, CommandFailed, run_measured, say, tool
 from bitymi_ns.measure.report.read import read_jsonl
 from bitymi_ns.safe_reading import read_json, reading
+from .cells import FILE, Cells, provenance
+from .matrix import Cell, Chain
+from .process import BenchError, CommandFailed, run_measured, say, tool
 
 CURVE = "training_curve.jsonl"
 

@@ -13,11 +13,11 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError
-from bitymi_ns.measure.bench.cells import NOT_OF_A_RUN, identity
-from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 from bitymi_ns.ranges import describe_problems
 from bitymi_ns.safe_reading import read_text, reading
+from .cells import NOT_OF_A_RUN, identity
+from .process import BenchError
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")]
 Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atlas`

@@ -8,12 +8,12 @@ from typing import Any
 
 from bitymi_ns.files import check_writable, write_errors_as, write_file
 from bitymi_ns.measure.markdown import rendered
-from bitymi_ns.measure.report.pictures import ERROR_SCALE, compare_views
-from bitymi_ns.measure.report.plots import draw_plots
-from bitymi_ns.measure.report.read import collect
-from bitymi_ns.measure.report.records import Records, ReportError, grouped, over_seeds
-from bitymi_ns.measure.report.tables import NOTES, quality_tables
 from bitymi_ns.safe_reading import open_regular
+from .pictures import ERROR_SCALE, compare_views
+from .plots import draw_plots
+from .read import collect
+from .records import Records, ReportError, grouped, over_seeds
+from .tables import NOTES, quality_tables
 
 PAGE = "index.html"
 GENERATOR = '<meta name="generator" content="bitymi report">'  # marks pages that may be replaced

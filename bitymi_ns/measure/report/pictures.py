@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from bitymi_ns.measure.report.records import grouped
 from bitymi_ns.safe_reading import open_regular
+from .records import grouped
 
 SIDE_BY_SIDE = re.compile(r"eval_img_(\d{4,})\.png$", re.IGNORECASE)
 """File name of a photograph beside its render, as `ns-eval --render-output-path` writes it."""

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from bitymi_ns.measure.figure import COLORS, INK, log_when_wide, panels, png, styled
-from bitymi_ns.measure.report.records import Curve, Evaluation
+from .records import Curve, Evaluation
 
 MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
 """Markers of bundles, one per format."""

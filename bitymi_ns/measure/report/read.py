@@ -9,8 +9,10 @@ from typing import Any, NoReturn
 
 from bitymi_ns.measure.bench.cells import FILE as CELLS
 from bitymi_ns.measure.bench.cells import NOT_OF_A_RUN, Cells, identity
-from bitymi_ns.measure.report.pictures import SIDE_BY_SIDE
-from bitymi_ns.measure.report.records import (
+from bitymi_ns.safe_reading import read_json, read_text, reading
+from bitymi_ns.trust import finite_numbers, json_of
+from .pictures import SIDE_BY_SIDE
+from .records import (
     Evaluation,
     Records,
     ReportError,
@@ -19,8 +21,6 @@ from bitymi_ns.measure.report.records import (
     grouped,
     link,
 )
-from bitymi_ns.safe_reading import read_json, read_text, reading
-from bitymi_ns.trust import finite_numbers, json_of
 
 MAX_BYTES = 64 << 20  # larger files are not evaluations
 ADVICE = "Write it again, or leave it out."

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.markdown import escaped
-from bitymi_ns.measure.report.records import Evaluation, grouped, means
+from .records import Evaluation, grouped, means
 
 MISSING = "–"
 ARROWS = {"up": " ↑", "down": " ↓", None: ""}  # to the better direction, as in the paper

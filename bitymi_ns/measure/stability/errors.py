@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import (
+from bitymi_ns.ops.backend import emulated_cuda, module
+from bitymi_ns.ops.project import geometry_of
+from bitymi_ns.ops.reference import render as reference_render
+from bitymi_ns.ops.reference import view_color as reference_view_color
+from bitymi_ns.ops.reference.view_color import view_directions
+from bitymi_ns.scene.camera import Camera
+from .scenes import (
     ALPHAS,
     PLAIN,
     RIM,
@@ -22,12 +28,6 @@ from bitymi_ns.measure.stability.scenes import (
     tile_images,
     tiles_of,
 )
-from bitymi_ns.ops.backend import emulated_cuda, module
-from bitymi_ns.ops.project import geometry_of
-from bitymi_ns.ops.reference import render as reference_render
-from bitymi_ns.ops.reference import view_color as reference_view_color
-from bitymi_ns.ops.reference.view_color import view_directions
-from bitymi_ns.scene.camera import Camera
 
 
 @dataclass(frozen=True)

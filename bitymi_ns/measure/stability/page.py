@@ -13,8 +13,8 @@ from bitymi_ns.files import check_writable, write_file
 from bitymi_ns.measure import markdown
 from bitymi_ns.measure.figure import panels, png, styled
 from bitymi_ns.measure.markdown import rendered
-from bitymi_ns.measure.stability.errors import PROBES, Backend, Errors, measure
-from bitymi_ns.measure.stability.scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Way, extreme_scenes
+from .errors import PROBES, Backend, Errors, measure
+from .scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Way, extreme_scenes
 
 ACCURATE = 1e-4  # largest error that counts as accurate
 ALLOWANCE = 4.0  # an error of at most this many times the effect of rounding the inputs is `LIMITED`

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.project import Pinhole
-from bitymi_ns.ops.reference.project import project
-from bitymi_ns.ops.reference.trace import SUPPORT, Trace, trace
+from .project import project
+from .trace import SUPPORT, Trace, trace
 
 
 @dataclass

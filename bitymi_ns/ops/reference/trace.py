@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.reference.project import Projection
+from .project import Projection
 
 SUPPORT = 3.0  # R: the kernel ends at 3 scale units
 ALPHA_MAX = 0.99

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from bitymi_ns.ops.reference.project import unit
+from .project import unit
 
 SOFTPLUS_BETA = 10 * math.log(2)
 

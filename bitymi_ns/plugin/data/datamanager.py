@@ -22,19 +22,19 @@ from bitymi_ns.capture import image_files, splits
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
-from bitymi_ns.plugin.data.cameras import check_cameras, to_camera, to_cameras
-from bitymi_ns.plugin.data.capture_checks import check_capture, declares_box, reporting_input_errors
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig, BundleCamerasConfig
-from bitymi_ns.plugin.data.dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
-from bitymi_ns.plugin.data.depth import with_depth
-from bitymi_ns.plugin.data.facts import KEY, CaptureFacts
-from bitymi_ns.plugin.data.views import LONGEST_SIDE, limit_size, with_lenses
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.exposure import restored
 from bitymi_ns.train.poses import carried, cross_matrix
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
+from .cameras import check_cameras, to_camera, to_cameras
+from .capture_checks import check_capture, declares_box, reporting_input_errors
+from .dataparser import BitymiDataParserConfig, BundleCamerasConfig
+from .dataset import BitymiDataset, CachedImages, drop_blank_views, photograph_bytes
+from .depth import with_depth
+from .facts import KEY, CaptureFacts
+from .views import LONGEST_SIDE, limit_size, with_lenses
 
 ALPHA_SAMPLES = 8  # photographs that are searched for transparent pixels
 FEW_VIEWS = 10  # training views below which multi-view scores are unreliable

@@ -21,10 +21,10 @@ from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import OPENCV_AXES
 from bitymi_ns.plugin.console import as_input_error, fail
-from bitymi_ns.plugin.data.depth import DepthKind
-from bitymi_ns.plugin.data.facts import KEY, CaptureFacts
-from bitymi_ns.plugin.data.views import Views, make_views, pinhole_cameras
 from bitymi_ns.trust import inside
+from .depth import DepthKind
+from .facts import KEY, CaptureFacts
+from .views import Views, make_views, pinhole_cameras
 
 
 @dataclass

@@ -21,9 +21,9 @@ from bitymi_ns.capture.image_files import ImageSummary, in_threads, pixels_of, r
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.pose_checks import rotations
 from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
-from bitymi_ns.plugin.data.facts import CaptureFacts
-from bitymi_ns.plugin.data.views import MOVED, select_views
 from bitymi_ns.train.views import MemoryBudget, OnDemand, over_background, resample_nearest
+from .facts import CaptureFacts
+from .views import MOVED, select_views
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for the images of a capture in a run on the CPU, where a step takes far longer than reading one."""

@@ -17,8 +17,8 @@ from bitymi_ns.capture.image_files import in_threads, read_image
 from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.points import GREY
 from bitymi_ns.plugin.console import say, warn
-from bitymi_ns.plugin.data.facts import KEY, CaptureFacts, DepthFit, FittedMaps
 from bitymi_ns.ranges import spread
+from .facts import KEY, CaptureFacts, DepthFit, FittedMaps
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
 """metric = one scale for all maps; relative = scale and shift of each; auto = by agreement with the points; off =

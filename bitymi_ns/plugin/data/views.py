@@ -17,7 +17,7 @@ from bitymi_ns.capture.pose_checks import check_spread, far_from_origin
 from bitymi_ns.capture.read import Capture
 from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, FrameOptions, MapFiles, Photograph, Pose
 from bitymi_ns.plugin.console import fail, listed, say
-from bitymi_ns.plugin.data.facts import KEY, CaptureFacts
+from .facts import KEY, CaptureFacts
 
 DATA = "BITYMI_DATA"
 """Environment variable with a capture's location, for which most of nerfstudio's commands have no option."""

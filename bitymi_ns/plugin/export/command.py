@@ -25,13 +25,13 @@ from bitymi_ns.interchange.extras import (
 )
 from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.export.summary import print_summary
-from bitymi_ns.plugin.export.target import bundle_config, bundle_version, check_room
-from bitymi_ns.plugin.export.trained import camera_files, compare, load_trained, preview, world_of
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
+from .summary import print_summary
+from .target import bundle_config, bundle_version, check_room
+from .trained import camera_files, compare, load_trained, preview, world_of
 
 
 @dataclass(kw_only=True)

@@ -24,10 +24,10 @@ from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes
 from bitymi_ns.ops import TexelAlpha
 from bitymi_ns.plugin.console import InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
+from .trained import load_trained, world_of
 
 NAME = "mesh"
 MOST_VIEWS = 400  # most fused training views, evenly spaced

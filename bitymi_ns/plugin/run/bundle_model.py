@@ -20,12 +20,12 @@ from bitymi_ns.ops import webgpu
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.data.views import DATA
-from bitymi_ns.plugin.run.device import kernel_device
-from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig, box_of
 from bitymi_ns.scene.baked import FAST
 from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.crop import Box
+from .device import kernel_device
+from .surfel_model import SurfelModel, SurfelModelConfig, box_of
 
 RENDERER, CROP = "BITYMI_RENDERER", "BITYMI_CROP"
 """Environment variables that override `BakedModelConfig.renderer` and `crop`: ns-eval, ns-render and ns-viewer have no

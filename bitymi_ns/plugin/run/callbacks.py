@@ -23,7 +23,6 @@ from bitymi_ns.ops.backend import give_back_memory
 from bitymi_ns.plugin.console import InputError, duration, fail, listed, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
-from bitymi_ns.plugin.run.memory import state_training
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.visibility import views_without_surfels
@@ -35,6 +34,7 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, covered_fraction
 from bitymi_ns.trust import json_of, no_links
+from .memory import state_training
 
 SOON = 60  # seconds: when a run that takes less will end is not said
 

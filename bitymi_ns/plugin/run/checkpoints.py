@@ -10,11 +10,11 @@ import torch
 
 from bitymi_ns.files import complete_file, reason
 from bitymi_ns.plugin.console import fail, listed, warn
-from bitymi_ns.plugin.run.checkpoint_reader import read_archive
-from bitymi_ns.plugin.run.checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check, check_unwritten
 from bitymi_ns.safe_reading import open_regular, reading
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.trust import json_of
+from .checkpoint_reader import read_archive
+from .checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check, check_unwritten
 
 STATE_VERSION = 2
 MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragments")

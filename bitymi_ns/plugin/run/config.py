@@ -26,13 +26,13 @@ from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
 from bitymi_ns.plugin.data.capture_checks import check_capture, read_early
 from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
-from bitymi_ns.plugin.run import checkpoints, folder_lock, torchrun
-from bitymi_ns.plugin.run.device import has_cuda_kernels, why_not_cuda
-from bitymi_ns.plugin.run.model import PARAMETER_GROUPS, BitymiModelConfig
-from bitymi_ns.plugin.run.trainer import BitymiPipelineConfig, BitymiTrainer
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS, adam
 from bitymi_ns.train.preset import load_preset
+from . import checkpoints, folder_lock, torchrun
+from .device import has_cuda_kernels, why_not_cuda
+from .model import PARAMETER_GROUPS, BitymiModelConfig
+from .trainer import BitymiPipelineConfig, BitymiTrainer
 
 SEEDS = 1 << 32  # end of numpy's range of seeds
 

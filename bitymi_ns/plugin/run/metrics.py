@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.plugin.console import warn, warn_once
-from bitymi_ns.plugin.run import lpips
 from bitymi_ns.train.losses import color_fitted, psnr
+from . import lpips
 
 LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
 """Backbones of LPIPS by name in the results: nerfstudio's and gsplat's convention, and 3DGS's."""

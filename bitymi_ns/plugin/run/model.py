@@ -18,9 +18,6 @@ from torch.nn import Parameter
 from bitymi_ns.ops.view_kinds import PARAMETERS
 from bitymi_ns.plugin.console import fail, say, warn
 from bitymi_ns.plugin.data.facts import CaptureFacts
-from bitymi_ns.plugin.run.callbacks import TrainingRun
-from bitymi_ns.plugin.run.checkpoints import STATE_VERSION
-from bitymi_ns.plugin.run.surfel_model import SurfelModel, SurfelModelConfig
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
@@ -32,6 +29,9 @@ from bitymi_ns.train.init import build_scene, limit_first_surfels
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.poses import aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
+from .callbacks import TrainingRun
+from .checkpoints import STATE_VERSION
+from .surfel_model import SurfelModel, SurfelModelConfig
 
 _NO_OPACITY = -1e4  # logit
 PARAMETER_GROUPS = (*PARAMETERS, "field_table", "field_mlp")

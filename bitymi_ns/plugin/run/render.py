@@ -20,12 +20,12 @@ from torch import Tensor
 from bitymi_ns.files import check_folder, check_writable, reserved, size_text, write_errors_as
 from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.run.camera_path import MOST_PIXELS, read_camera_path
-from bitymi_ns.plugin.run.films import RATES, check_frames, film, frames
-from bitymi_ns.plugin.run.surfel_model import SurfelModel
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.baked import as_bytes
+from .camera_path import MOST_PIXELS, read_camera_path
+from .films import RATES, check_frames, film, frames
+from .surfel_model import SurfelModel
 
 TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
 """nerfstudio's script classes that render along a path."""

@@ -20,11 +20,11 @@ from torch.nn import Parameter
 from bitymi_ns.plugin.console import InputError, warn_once
 from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
 from bitymi_ns.plugin.data.dataset import POSE_STEP
-from bitymi_ns.plugin.run.device import kernel_device
-from bitymi_ns.plugin.run.metrics import image_metrics, render_milliseconds
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.crop import Box
 from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background, shown
+from .device import kernel_device
+from .metrics import image_metrics, render_milliseconds
 
 OVERDRAW_SCALE = 64.0
 """Blended surfels per pixel at the end of overdraw's colour map, fixed to compare runs."""

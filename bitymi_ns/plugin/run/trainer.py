@@ -27,12 +27,12 @@ from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.hooks import print_brackets
-from bitymi_ns.plugin.run import checkpoints, folder_lock, torchrun
-from bitymi_ns.plugin.run.checkpoint_schema import Entry, restore_optimizer
-from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.safe_reading import reading
 from bitymi_ns.train import optimizers
 from bitymi_ns.train.processes import ProcessesApart, ProcessLost
+from . import checkpoints, folder_lock, torchrun
+from .checkpoint_schema import Entry, restore_optimizer
+from .model import BitymiModel
 
 if TYPE_CHECKING:
     from torch.cuda.amp.grad_scaler import GradScaler

@@ -38,7 +38,7 @@ PARTS = {
 TYPES = {
     "EARLIER": "Record<string, string>",
     "LATER": "readonly string[]",
-    "LEAN_COUNTS": "Record<string, readonly number[] | null>",
+    "REDUCED_COUNTS": "Record<string, readonly number[] | null>",
     "LINEAR": "Record<string, { words: readonly number[]; limit: number } & Record<'least' | 'absent', number | null>>",
     "PLY": "Record<string, readonly [number, number | null]>",
     "RANGES": "Record<string, readonly [number, number]>",
@@ -117,7 +117,7 @@ def at_word(parameter: str) -> tuple[int, int]:
 def tables() -> str:
     """Write the module."""
     kinds = VIEW_COLORS.items()
-    terms = {name: of_width(kind.lean_limit, kind.lean_width) for name, kind in kinds}
+    terms = {name: of_width(kind.reduced_limit, kind.reduced_width) for name, kind in kinds}
     shapes = {name: surfel_codes.term_numbers(name)[1] for name in VIEW_COLORS}
     whole = {}
     for name, kind in kinds:
@@ -159,9 +159,10 @@ def tables() -> str:
             for column, p in surfel_codes.LINEAR.items()
         },
         "KINDS": KINDS,
-        "LEAN_WIDTH": {name: kind.lean_width for name, kind in kinds},
-        "LEAN_COUNTS": {
-            name: None if kind.lean_counts == range(MAX_TERMS + 1) else list(kind.lean_counts) for name, kind in kinds
+        "REDUCED_WIDTH": {name: kind.reduced_width for name, kind in kinds},
+        "REDUCED_COUNTS": {
+            name: None if kind.reduced_counts == range(MAX_TERMS + 1) else list(kind.reduced_counts)
+            for name, kind in kinds
         },
         "TERM_LIMITS": terms,
         "SHAPES": {

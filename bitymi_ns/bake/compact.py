@@ -93,7 +93,7 @@ class Coder:
         progress: Progress = no_progress,
         held_out: Sequence[View] = (),
     ) -> None:
-        """Measure `baked`, with lean view colours, in the training views; without any the reference steps are taken.
+        """Measure `baked`, with reduced view colours, in the training views; without any the reference steps are taken.
         Alternatives are stated on the `held_out` views, without any on the training views. `background`: [3]."""
         self._baked, self._pictures = baked, Pictures(views, background, options.views, baked.device)
         self._held_out = Pictures(held_out, background, options.views, baked.device)

@@ -79,8 +79,8 @@ class ColumnNoise:
 def column_noise(
     scene: BakedScene, sizes: npt.ArrayLike, extent: Tensor, pictures: Pictures, progress: Progress = no_progress
 ) -> ColumnNoise:
-    """Measure the image error of each column rounded alone, at its reference step. `scene`: with lean view colours, on
-    the CPU, of N surfels. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none. `extent`: [N] their half sides."""
+    """Measure the image error of each column rounded alone, at its reference step. `scene`: N surfels with reduced view
+    colours, on the CPU. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none. `extent`: [N] their half sides."""
     codes, order = code_surfels(scene.surfels, scene.view_color, sizes, extent, REFERENCE)
     moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
     moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}

@@ -18,8 +18,9 @@ _SLACK = 1.02  # largest ratio to the stated error: sums in another order, rotat
 
 
 def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
-    """Measure lean view colours against those of `surfels`, the scene that was baked, matched by `_keys`, and compare
-    with the error that bundle.json states. `cameras`: its training views."""
+    """Compare the error of the reduced view colours against `surfels`, the trained scene, with the stated one.
+
+    `cameras`: of the training views."""
     name = "error of the view colours"
     if "view_terms" not in bundle.scene.surfels:
         return Check(name, True, "none: all of them are kept")

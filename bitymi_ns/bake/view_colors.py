@@ -13,7 +13,7 @@ from bitymi_ns.codec.limits import beyond
 from bitymi_ns.codec.quantise import STEPS
 from bitymi_ns.ops import backend, view_color
 from bitymi_ns.ops.constants import COLOR_BIAS
-from bitymi_ns.ops.view_color import LEAN, view_base
+from bitymi_ns.ops.view_color import REDUCED, view_base
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere, kind_of
 from bitymi_ns.progress import Progress, no_progress
 from bitymi_ns.scene.camera import Camera
@@ -42,8 +42,8 @@ class ColorChoices:
     choices: Sequence[tuple[Tensor, Tensor, Tensor]]
 
     def at(self, lmbda: float | None = None) -> dict[str, Tensor]:
-        """Choose the lean view colours of the least error + lambda x bits. `lmbda`: squared error per bit, colours from
-        0 to 1; None = those within the tolerance."""
+        """Choose the reduced view colours of the least error + lambda x bits. `lmbda`: squared error per bit, colours
+        in [0, 1]; None = those within the tolerance."""
         numbers = torch.arange(self.error.shape[1])
         if lmbda is None:
             count = torch.where(self.error.isfinite(), numbers, 0).amax(1)
@@ -55,20 +55,20 @@ class ColorChoices:
             chosen = count[rows] == terms.shape[1]
             base[rows[chosen]] = bases[chosen]
             listed[first[rows[chosen], None] + torch.arange(terms.shape[1])] = terms[chosen]
-        return dict(zip(LEAN, (base, torch.stack([first, count], dim=1).int(), listed), strict=True))
+        return dict(zip(REDUCED, (base, torch.stack([first, count], dim=1).int(), listed), strict=True))
 
 
 def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
-    """Estimate the memory of `color_choices`, bytes. `most`: lean terms of a surfel."""
+    """Estimate the memory of `color_choices`, bytes. `most`: reduced terms of a surfel."""
     entry = VIEW_COLORS[kind]
     numbers = range(most + 1) if entry.sites is not None else sorted({0, most})
-    of_surfel = 4 * (most + 1) + sum(8 + 4 * (3 + entry.lean_width * number) for number in numbers)
+    of_surfel = 4 * (most + 1) + sum(8 + 4 * (3 + entry.reduced_width * number) for number in numbers)
     return surfels * (of_surfel + views)  # a bool per view: whether it shows the surfel
 
 
 def shown_at(kind: str, params: Mapping[str, Tensor], directions: Tensor) -> Tensor:
-    """Evaluate the blended colour max(f_view + 0.5, 0) of n surfels, all or lean, by the renderers' kernels: [n, D, 3]
-    in directions [n, D, 3], unit vectors."""
+    """Evaluate the blended colour max(f_view + 0.5, 0) [n, D, 3] of n surfels by the renderers' kernels, in directions
+    [n, D, 3], unit vectors."""
     origin = directions.new_zeros(3)
     columns = [view_color(kind, params, d.contiguous(), origin) for d in directions.unbind(1)]
     return view_base(torch.stack(columns, dim=1))
@@ -141,7 +141,7 @@ def color_choices(
         rest = torch.arange(len(chunk.rows), device=means.device)
         color = _one_color(target, chunk.valid, weight, tolerance / opacity[chunk.rows])
         base = (color - COLOR_BIAS) / entry.base_unit
-        rest = rest_of(rest, base, base.new_zeros(len(base), 0, entry.lean_width), color[:, None])
+        rest = rest_of(rest, base, base.new_zeros(len(base), 0, entry.reduced_width), color[:, None])
         if entry.sites is not None:
             vectors, colors = entry.sites(*own)
             counts = chunk.subset(weight, FIT_VIEWS)
@@ -158,7 +158,7 @@ def color_choices(
         choices.append((rows.cpu(), *(value[rest].cpu() for value in own)))
         done += len(chunk.rows)
         progress("reducing the view colours", done, len(means))
-    return ColorChoices(error.cpu(), largest.cpu(), entry.lean_width, choices)
+    return ColorChoices(error.cpu(), largest.cpu(), entry.reduced_width, choices)
 
 
 def _weights(chunk: Directions, weights: Tensor) -> Tensor:
@@ -196,21 +196,21 @@ def _one_color(target: Tensor, valid: Tensor, weight: Tensor, allowed: Tensor) -
 def view_color_errors(
     kind: str,
     full: Mapping[str, Tensor],
-    lean: Mapping[str, Tensor],
+    reduced: Mapping[str, Tensor],
     means: Tensor,
     seen: Tensor,
     centers: Tensor,
     opacity: Tensor,
 ) -> Tensor:
     """Measure the largest error of every surfel's view colour over the directions of `view_directions`, times its
-    largest blending weight, in 8-bit steps: [N]. `full`, `lean`: parameters as trained, and lean ones. `seen`: [V, N]
-    bool, the training views that see each surfel; V may be 0. `centers`, `opacity`: as in `color_choices`."""
+    largest blending weight, in 8-bit steps: [N]. `full`, `reduced`: parameters before and after. `seen`: [V, N] bool,
+    training views that see each surfel; V may be 0. `centers`, `opacity`: as in `color_choices`."""
     error = means.new_zeros(len(means))
     for chunk in view_directions(means, seen, centers):
         exact = shown_at(kind, {name: full[name][chunk.rows] for name in VIEW_COLORS[kind].names}, chunk.unit)
-        rows = {name: lean[name][chunk.rows] for name in ("view_base", "view_span")}
-        reduced = shown_at(kind, {**rows, "view_terms": lean["view_terms"]}, chunk.unit)
-        error[chunk.rows] = STEPS * ((exact - reduced).abs().amax(2) * chunk.valid).amax(1) * opacity[chunk.rows]
+        rows = {name: reduced[name][chunk.rows] for name in ("view_base", "view_span")}
+        kept = shown_at(kind, {**rows, "view_terms": reduced["view_terms"]}, chunk.unit)
+        error[chunk.rows] = STEPS * ((exact - kept).abs().amax(2) * chunk.valid).amax(1) * opacity[chunk.rows]
     return error
 
 
@@ -227,20 +227,20 @@ def reduce_view_colors(
     squares = means.new_zeros(0, len(means)) if inputs.views is None else inputs.views.squares
     views = (squares, centers_of(inputs.cameras, means), opacity)
     choices = color_choices(surfels, kind, *views, tolerance, inputs.near, progress)
-    lean, entry = choices.at(), VIEW_COLORS[kind]
+    reduced, entry = choices.at(), VIEW_COLORS[kind]
     before = sum(each[0].numel() for each in entry.of(surfels)) if len(means) else 0
-    sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a lean colour, and its terms
+    sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a reduced colour, and its terms
     stated = ViewColorError(
         kind=kind,
         tolerance=tolerance,
         unit="8-bit steps, largest over the directions and channels, weighted by the blending weight",
-        sites=Kept(before=sites * len(means), after=len(means) + len(lean["view_terms"])),
-        one_color=int((lean["view_span"][:, 1] == 0).sum()),
-        bytes=Kept(before=4 * before * len(means), after=4 * (4 * len(means) + lean["view_terms"].numel())),
+        sites=Kept(before=sites * len(means), after=len(means) + len(reduced["view_terms"])),
+        one_color=int((reduced["view_span"][:, 1] == 0).sum()),
+        bytes=Kept(before=4 * before * len(means), after=4 * (4 * len(means) + reduced["view_terms"].numel())),
         error=Percentiles.of(choices.largest),
     )
     kept = {name: value for name, value in surfels.items() if name not in entry.names}
-    return kept | lean, choices, stated
+    return kept | reduced, choices, stated
 
 
 FIT_STEPS = 6

@@ -210,7 +210,7 @@ def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
         if low < 0 or (sides < 2).any() or (sides > MOST_EXPONENT).any():
             raise StreamError("a tile has a side that is not a power of two from 4 to 4096")
     if name == "view_count":
-        counts = VIEW_COLORS[info.view_color].lean_counts
+        counts = VIEW_COLORS[info.view_color].reduced_counts
         if not np.isin(codes, list(counts)).all() or int(codes.sum()) != (info.terms or 0):
             raise StreamError("the view colours do not have the terms that bundle.json counts")
 

@@ -28,8 +28,8 @@ SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
 VERSION = "6.0"
 EARLIER = {"1.4": SURFELS, "2.3": SURFELS, "4.0": SURFELS, "5.0": COMPACT_SURFELS}
-"""Versions that are read as `VERSION`, and the file of surfels that each had: whole view colours, lean ones, alphas of
-texels, entropy-coded columns."""
+"""Versions that are read as `VERSION`, and their file of surfels: whole view colours, reduced ones, alphas of texels,
+entropy-coded columns."""
 POSTER = "poster.webp"  # optional picture of a viewer's first view: `bundle.poster`
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
 _FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
@@ -125,8 +125,8 @@ class Surfels(Part):
     residual: str = "of a surfel without a tile: residual_0..2, at weights of at least render.weight_bound"
     activations: dict[str, str] = ACTIVATIONS
     sites: Whole | None = None  # Spherical Voronoi sites per surfel, if all are kept
-    terms: Whole | None = None  # terms of all lean view colours; None: view colours are complete
-    view_terms: str | None = None  # formula of a lean view colour
+    terms: Whole | None = None  # terms of all reduced view colours; None: view colours are complete
+    view_terms: str | None = None  # formula of a reduced view colour
 
 
 class AtlasEntry(Part):

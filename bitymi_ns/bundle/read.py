@@ -55,8 +55,8 @@ _CHUNK = 1 << 22
 
 @dataclass
 class Bundle:
-    """A loaded bundle: its scene on the CPU, whose view colours may be lean (`ops.view_color.LEAN`), bundle.json, and
-    the cameras of the capture, training and held out; empty without cameras.json."""
+    """A loaded bundle: scene on the CPU, with whole or reduced view colours, bundle.json, and the cameras of the
+    capture, training and held out; empty without cameras.json."""
 
     scene: BakedScene
     info: Manifest

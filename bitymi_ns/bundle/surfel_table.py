@@ -6,7 +6,7 @@ The names of 3D Gaussian splatting come first, so that its viewers show a sensib
 units, tile_extent, and the mean residual residual_0..2. Texels with alphas add alpha, their mean. A surfel without a
 tile is drawn with its mean residual and alpha.
 
-Lean view colours (`ops.view_color.LEAN`) have view_base_0..2 and view_terms (number of terms) instead; the terms,
+Reduced view colours (`ops.view_color.REDUCED`) have view_base_0..2 and view_terms (number of terms) instead; the terms,
 surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...
 """
 
@@ -24,7 +24,7 @@ from bitymi_ns.codec.surfel_codes import term_rows
 from bitymi_ns.ops import view_color
 from bitymi_ns.ops.constants import MAX_TERMS, SH_C0, SUPPORT
 from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS
-from bitymi_ns.ops.view_color import LEAN, check_lean
+from bitymi_ns.ops.view_color import REDUCED, check_reduced
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere, kind_of
 from bitymi_ns.ply import PlyError
 from bitymi_ns.scene.baked import BakedScene
@@ -40,13 +40,13 @@ TERMS = "view_term"
 COLUMNS: dict[str, tuple[str, ...]] = {
     **{name: parameter.columns for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.columns},
     "mean_residual": ("residual_0", "residual_1", "residual_2"),
-    "view_terms": tuple(f"term_{i}" for i in range(max(kind.lean_width for kind in VIEW_COLORS.values()))),
+    "view_terms": tuple(f"term_{i}" for i in range(max(kind.reduced_width for kind in VIEW_COLORS.values()))),
 }
 
 
 def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> Tensor:
     """Average f_view over all directions, without the bias 0.5, for display: [N, 3]. By the closed form of the kind
-    (`ViewColor.mean`) if there is one; else, and for lean colours (which need `kind`), as a mean over 32 directions."""
+    (`ViewColor.mean`) if there is one; else, and for reduced colours (which need `kind`), over 32 directions."""
     kind = kind or kind_of(surfels)
     entry = VIEW_COLORS[kind]
     if entry.mean is not None and "view_terms" not in surfels:
@@ -57,10 +57,10 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
 
 
 def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDArray]:
-    """Convert a scene to the columns of surfels.ply, without the terms of lean view colours (`term_columns`). Mean
+    """Convert a scene to the columns of surfels.ply, without the terms of reduced view colours (`term_columns`). Mean
     residuals are included in the colour that other viewers show; residuals and extents get columns if present."""
     kind, surfels, tiles = scene.view_color, scene.surfels, scene.tiles.numpy()
-    lean = "view_terms" in surfels
+    reduced = "view_terms" in surfels
     surfels = {name: _plain(value) for name, value in surfels.items()}
     color = mean_view_color(surfels, kind)
     if scene.mean_residual is not None:
@@ -78,11 +78,11 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
     for name in GEOMETRY_PARAMETERS:  # in the table's order, behind those of 3D Gaussian splatting
         if name not in ("means", "opacity_logits", "log_scales", "quats"):
             groups[COLUMNS[name]] = surfels[name].reshape(len(quats), -1)
-    for name in ("view_base",) if lean else VIEW_COLORS[kind].names:
+    for name in ("view_base",) if reduced else VIEW_COLORS[kind].names:
         values = surfels[name].reshape(len(quats), int(np.prod(surfels[name].shape[1:])))
         groups[_numbered(name, values.shape[1])] = values
     columns = {name: values[:, i].numpy() for names, values in groups.items() for i, name in enumerate(names)}
-    if lean:
+    if reduced:
         columns[COUNT_COLUMN] = surfels["view_span"][:, 1].numpy()
     columns |= {name: tiles[:, i] for i, name in enumerate(TILE_COLUMNS)}
     if scene.extent is not None:
@@ -96,7 +96,7 @@ def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDAr
 
 
 def term_columns(surfels: Mapping[str, Tensor]) -> dict[str, npt.NDArray]:
-    """Convert the terms of lean view colours to columns, surfel after surfel: term_0, term_1, ...; [T] float32."""
+    """Convert the terms of reduced view colours to columns, surfel after surfel: term_0, term_1, ...; [T] float32."""
     span = surfels["view_span"].long().cpu().numpy()  # spans may lie anywhere, the file has them in order
     ordered = surfels["view_terms"].detach().float().cpu().numpy()[term_rows(span)]
     return {name: ordered[:, i] for i, name in enumerate(_numbered("term", ordered.shape[1]))}
@@ -138,7 +138,7 @@ def from_columns(
     Args:
         columns: of element `vertex`.
         kind: a name of `ops.VIEW_COLORS`.
-        terms: columns of element `view_term`, for lean view colours; None if absent.
+        terms: columns of element `view_term`, for reduced view colours; None if absent.
         extent: half side of the tiles in scale units if there is no column.
         has_alpha: require mean alphas.
 
@@ -156,7 +156,7 @@ def from_columns(
         for name, parameter in GEOMETRY_PARAMETERS.items()
     }
     if terms is not None:
-        surfels |= _lean_from_columns(columns, terms, kind)
+        surfels |= _reduced_from_columns(columns, terms, kind)
     else:
         surfels |= _full_from_columns(columns, kind, count)
     check_limits(surfels, kind)
@@ -192,10 +192,10 @@ def _full_from_columns(columns: Mapping[str, npt.NDArray], kind: str, count: int
     return surfels
 
 
-def _lean_from_columns(
+def _reduced_from_columns(
     columns: Mapping[str, npt.NDArray], terms: Mapping[str, npt.NDArray], kind: str
 ) -> dict[str, Tensor]:
-    names = _numbered("term", VIEW_COLORS[kind].lean_width)
+    names = _numbered("term", VIEW_COLORS[kind].reduced_width)
     if set(terms) != set(names):
         raise PlyError(f"the element {TERMS} needs the properties {names[0]} to {names[-1]}, not {sorted(terms)}")
     count = _stack(columns, (COUNT_COLUMN,), np.int32)[:, 0].long()
@@ -203,12 +203,12 @@ def _lean_from_columns(
         raise PlyError(f"{COUNT_COLUMN} does not count the {len(terms[names[0]])} rows of {TERMS}")
     span = torch.stack([count.cumsum(0) - count, count], dim=1).int()
     values = (_stack(columns, _numbered("view_base", 3)), span, _stack(terms, names))
-    lean: dict[str, Tensor] = dict(zip(LEAN, values, strict=True))
+    reduced: dict[str, Tensor] = dict(zip(REDUCED, values, strict=True))
     try:
-        check_lean(kind, lean, len(count))
+        check_reduced(kind, reduced, len(count))
     except ValueError as error:
         raise PlyError(str(error)) from error
-    return lean
+    return reduced
 
 
 def _plain(value: Tensor) -> Tensor:

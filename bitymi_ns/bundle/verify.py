@@ -131,22 +131,24 @@ def _count_tiles(tiles: Tensor, atlas: Tensor | None) -> Tensor:
 
 def _check_counts(bundle: Bundle) -> Check:
     statistics, scene = bundle.info.statistics, bundle.scene
-    surfels, texels, lean = statistics.surfels, statistics.texels, statistics.view_color
+    surfels, texels, reduced = statistics.surfels, statistics.texels, statistics.view_color
     counts = [
         ("surfels kept", surfels and surfels.kept, len(bundle)),
         ("texels kept", texels and texels.kept, int(scene.tiles[:, 3:].long().prod(1).sum())),
         ("surfels without_tile", surfels and surfels.without_tile, int((scene.tiles[:, 3] == 0).sum())),
     ]
-    if lean is not None and "view_terms" in scene.surfels:
+    if reduced is not None and "view_terms" in scene.surfels:
         one_color = int((scene.surfels["view_span"][:, 1] == 0).sum())
         counts += [
-            ("view colour sites", lean.sites.after, len(bundle) + len(scene.surfels["view_terms"])),
-            ("surfels of one colour", lean.one_color, one_color),
+            ("view colour sites", reduced.sites.after, len(bundle) + len(scene.surfels["view_terms"])),
+            ("surfels of one colour", reduced.one_color, one_color),
         ]
     for name, stated, there in counts:
         if stated is not None and stated != there:
             return Check("statistics", False, f"{name}: {stated:,} stated, {there:,} found")
     detail = "agree with the files"
-    if lean is not None:
-        detail += f"; error of a view colour at most {steps_text(lean.error.p100)} steps, tolerance {lean.tolerance:g}"
+    if reduced is not None:
+        detail += (
+            f"; error of a view colour at most {steps_text(reduced.error.p100)} steps, tolerance {reduced.tolerance:g}"
+        )
     return Check("statistics", True, detail)

@@ -17,7 +17,7 @@ from bitymi_ns.codec.limits import ALPHA_LIMIT
 from bitymi_ns.codec.quantise import Atlas, EncodedAtlas
 from bitymi_ns.codec.texel_codes import SceneCodes
 from bitymi_ns.files import complete_folder, reason, size_text
-from bitymi_ns.ops.view_color import check_lean
+from bitymi_ns.ops.view_color import check_reduced
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
 from . import compact, ktx2
@@ -156,7 +156,7 @@ def _describe(
     """Build the `info` of `manifest.describe`, without the list of files."""
     surfels, kind = scene.surfels, scene.view_color
     entry = VIEW_COLORS[kind]
-    means, lean = surfels["means"].detach(), "view_terms" in surfels
+    means, reduced = surfels["means"].detach(), "view_terms" in surfels
     empty = len(means) == 0
     described: dict[str, Any] = {
         "version": VERSION,
@@ -173,9 +173,9 @@ def _describe(
         "bounds": {"min": [0.0] * 3 if empty else means.amin(0), "max": [0.0] * 3 if empty else means.amax(0)},
         "statistics": dict(statistics or {}),
     }
-    if lean:
+    if reduced:
         described["surfels"]["terms"] = len(surfels["view_terms"])
-        described["surfels"]["view_terms"] = entry.lean_formula
+        described["surfels"]["view_terms"] = entry.reduced_formula
     else:
         if entry.stated is not None:
             described["surfels"][entry.stated] = entry.terms(surfels)
@@ -222,7 +222,7 @@ def _check_surfels(scene: BakedScene) -> None:
     surfels, tiles, kind, mean_residual = scene.surfels, scene.tiles, scene.view_color, scene.mean_residual
     if "view_terms" in surfels:
         try:
-            check_lean(kind, surfels, len(tiles))
+            check_reduced(kind, surfels, len(tiles))
         except ValueError as error:
             raise BundleError(str(error)) from error
     for name, value in surfels.items():

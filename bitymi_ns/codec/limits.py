@@ -29,7 +29,7 @@ LIMITS: dict[str, Limit] = {
 def limit_of(name: str, kind: str) -> Limit:
     """Return the largest absolute values of a parameter, as in `LIMITS`, of view_terms or mean_residual; else
     infinite."""
-    return VIEW_COLORS[kind].lean_limit if name == "view_terms" else LIMITS.get(name, (float("inf"),))
+    return VIEW_COLORS[kind].reduced_limit if name == "view_terms" else LIMITS.get(name, (float("inf"),))
 
 
 def beyond(name: str, kind: str, values: Tensor) -> Tensor:

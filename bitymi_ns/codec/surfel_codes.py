@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns.ops.parameters import GEOMETRY_PARAMETERS, SMALLEST_SHARE, Parameter
-from bitymi_ns.ops.view_color import LEAN
+from bitymi_ns.ops.view_color import REDUCED
 from bitymi_ns.ops.view_kinds import COLOR_LIMIT, VIEW_COLORS
 from . import streams
 from .limits import EXTENTS, limit_of
@@ -96,9 +96,9 @@ class SurfelCodes:
         return torch.from_numpy(extent.astype(np.float32)).clamp(*EXTENTS)
 
     def surfels(self) -> dict[str, Tensor]:
-        """Decode the parameters, float32, with lean view colours."""
+        """Decode the parameters, float32, with reduced view colours."""
         entry, (colors, shapes) = VIEW_COLORS[self.kind], term_numbers(self.kind)
-        terms = np.zeros((len(self.codes["term_color"]), entry.lean_width))
+        terms = np.zeros((len(self.codes["term_color"]), entry.reduced_width))
         count = self.codes["view_count"][:, 0]
         terms[:, colors] = self.steps["term_color"] * from_differences(self.codes["term_color"])
         terms[:, shapes] = _sinh(self._linear("term_shape"))
@@ -140,9 +140,9 @@ def code_surfels(
     surfels: Mapping[str, Tensor], kind: str, sizes: npt.ArrayLike, extent: Tensor, steps: Mapping[str, float]
 ) -> tuple[SurfelCodes, Tensor]:
     """Quantise surfels and sort them in Morton order; returns the codes, and their order: [N] int64 rows of `surfels`.
-    `surfels`: on the CPU, with lean view colours. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none. `extent`:
-    [N] half sides of the tiles, scale units. `steps`: by column, as in `REFERENCE`; the step of place grows if its
-    cells would exceed `POSITION_BITS`."""
+    `surfels`: on the CPU, with reduced view colours. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none.
+    `extent`: [N] half sides of the tiles, scale units. `steps`: by column, as in `REFERENCE`; the step of place grows
+    if its cells would exceed `POSITION_BITS`."""
     values = {name: value.detach().double().numpy() for name, value in surfels.items()}
     frame, step, cell = _grid_cells(values["means"], steps["place"])
     steps = {**steps, "place": step}
@@ -175,9 +175,9 @@ def code_surfels(
 
 
 def reordered(surfels: Mapping[str, Tensor], order: Tensor) -> dict[str, Tensor]:
-    """Reorder surfels with lean view colours by rows [N]; terms follow their surfels."""
+    """Reorder surfels with reduced view colours by rows [N]; terms follow their surfels."""
     span = surfels["view_span"].long()[order]
-    moved = {name: value[order].contiguous() for name, value in surfels.items() if name not in LEAN}
+    moved = {name: value[order].contiguous() for name, value in surfels.items() if name not in REDUCED}
     moved["view_base"] = surfels["view_base"][order].contiguous()
     moved["view_terms"] = surfels["view_terms"][torch.from_numpy(term_rows(span.numpy()))].contiguous()
     moved["view_span"] = torch.stack([span[:, 1].cumsum(0) - span[:, 1], span[:, 1]], dim=1).int()
@@ -185,9 +185,9 @@ def reordered(surfels: Mapping[str, Tensor], order: Tensor) -> dict[str, Tensor]
 
 
 def term_numbers(kind: str) -> tuple[list[int], list[int]]:
-    """Split the indices of a lean term's numbers into colours (in threes) and others."""
+    """Split the indices of a reduced term's numbers into colours (in threes) and others."""
     limit = limit_of("view_terms", kind)
-    every = limit * (VIEW_COLORS[kind].lean_width if len(limit) == 1 else 1)
+    every = limit * (VIEW_COLORS[kind].reduced_width if len(limit) == 1 else 1)
     colors = [i for i, each in enumerate(every) if each == COLOR_LIMIT]
     return colors, [i for i in range(len(every)) if i not in colors]
 

@@ -30,7 +30,7 @@ class SurfelColors:
 
 
 def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Select surfels by row. The terms of lean view colours are all kept, as `view_span` indexes them."""
+    """Select surfels by row. The terms of reduced view colours are all kept, as `view_span` indexes them."""
     return {name: value if name == "view_terms" else value[rows] for name, value in surfels.items()}
 
 

@@ -16,7 +16,7 @@ from .baked_scene import IMAGES, LEVELS, BakedSceneLike, check_images, common_si
 from .constants import TILE
 from .parameters import GEOMETRY
 from .project import CameraLike, geometry_of
-from .view_color import LEAN, check_lean, check_view_color, lettered
+from .view_color import REDUCED, check_reduced, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
 
 
@@ -153,8 +153,8 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
             raise TypeError(f"the CUDA renderer takes float32 surfels, but {name} is {value.dtype}")
     p = {name: value.detach().contiguous() for name, value in scene.surfels.items()}
     if "view_terms" in p:
-        check_lean(scene.view_color, p, len(scene.tiles))
-        colors = dict(zip(("base", "span", "lean"), (p[name] for name in LEAN), strict=True))
+        check_reduced(scene.view_color, p, len(scene.tiles))
+        colors = dict(zip(("base", "span", "lean"), (p[name] for name in REDUCED), strict=True))
     else:
         terms = check_view_color(scene.view_color, p, len(scene.tiles))
         colors = lettered(VIEW_COLORS[scene.view_color].of(p)) | {"terms": terms}

@@ -10,8 +10,8 @@ from .constants import COLOR_BIAS, MAX_TERMS
 from .parameters import Tensors
 from .view_kinds import entry_of
 
-LEAN = ("view_base", "view_span", "view_terms")
-"""Parameter names of lean view colours, which have a varying number of terms per surfel."""
+REDUCED = ("view_base", "view_span", "view_terms")
+"""Parameter names of reduced view colours, which have a varying number of terms per surfel."""
 
 
 def view_base(f_view: Tensor) -> Tensor:
@@ -71,18 +71,18 @@ def check_view_color(kind: str, params: Tensors, n: int) -> int:
     return terms
 
 
-def check_lean(kind: str, params: Tensors, n: int) -> None:
-    """Check the lean view colours of n surfels; synchronises with a CUDA device. Raises ValueError: wrong shape or
+def check_reduced(kind: str, params: Tensors, n: int) -> None:
+    """Check the reduced view colours of n surfels; synchronises with a CUDA device. Raises ValueError: wrong shape or
     dtype, a span outside the terms, or harmonics that end within a degree."""
     entry = entry_of(kind)
-    base, span, terms = (params[name] for name in LEAN)
+    base, span, terms = (params[name] for name in REDUCED)
     if tuple(base.shape) != (n, 3) or tuple(span.shape) != (n, 2) or span.dtype != torch.int32:
         raise ValueError(f"view_base must be [{n}, 3] and view_span [{n}, 2] int32")
-    if terms.dim() != 2 or terms.shape[1] != entry.lean_width:
-        raise ValueError(f"view_terms must be [terms, {entry.lean_width}], not {list(terms.shape)}")
+    if terms.dim() != 2 or terms.shape[1] != entry.reduced_width:
+        raise ValueError(f"view_terms must be [terms, {entry.reduced_width}], not {list(terms.shape)}")
     first, count = span.long().unbind(1)
     allowed = torch.zeros(MAX_TERMS + 1, dtype=torch.bool)
-    allowed[list(entry.lean_counts)] = True
+    allowed[list(entry.reduced_counts)] = True
     bad = (first < 0) | (count < 0) | (count > MAX_TERMS) | (first + count > len(terms))
     bad |= ~allowed.to(count.device)[count.clamp(0, MAX_TERMS)]
     if bad.any():
@@ -94,9 +94,8 @@ def view_color(kind: str, params: Tensors, means: Tensor, center: Tensor, active
 
     Args:
         kind: a name of `VIEW_COLORS`; sv is the paper's.
-        params: the parameters of its entry; or those of lean colours (`LEAN`), without gradient: view_base [N, 3],
-            view_span [N, 2] int32 (first term, number of terms), view_terms [terms, the kind's lean_width]. Others are
-            ignored.
+        params: the parameters of its entry; or those of reduced colours, without gradient: view_base [N, 3], view_span
+            [N, 2] int32 (first term, number of terms), view_terms [terms, reduced_width]. Others are ignored.
         means: [N, 3] world positions.
         center: [3] camera centre, world; used in float64 (`Camera.exact_center`); may require a gradient.
         active: [N] bool; inactive rows give 0 and get no gradient; None: all active.
@@ -110,7 +109,7 @@ def view_color(kind: str, params: Tensors, means: Tensor, center: Tensor, active
     n = means.shape[0]
     flags = means.new_ones(n, dtype=torch.uint8) if active is None else _flags(active.to(means.device))
     if "view_terms" in params:
-        base, span, terms = (params[name] for name in LEAN)
+        base, span, terms = (params[name] for name in REDUCED)
         out, to = means.new_empty(n, 3), _directions(means, center, flags)
         colors = {"base": dense(base, means), "span": span.contiguous(), "lean": dense(terms, means)}
         kernel("view_color_forward", means)(kind=kind, **colors, **to, out=out)

@@ -23,8 +23,8 @@ VECTOR_LIMIT = 2e7  # of differences of two unit vectors, each times a temperatu
 class ViewColor:
     """A kind of view colour.
 
-    A term is a site, a coefficient or a lobe. Lean colours (`ops.view_color.LEAN`) have a base colour and a varying
-    number of terms per surfel.
+    A term is a site, a coefficient or a lobe. Reduced colours (`ops.view_color.REDUCED`) have a base colour and a
+    varying number of terms per surfel.
     """
 
     title: str  # display name
@@ -34,16 +34,16 @@ class ViewColor:
     parameters: tuple[Parameter, ...]  # two or three, in the kernels' order; the second has one row per term
     counts: Collection[int]  # allowed numbers of terms
     rule: str  # the same in words, for messages, counting rows of the second parameter
-    base_terms: int  # terms that the base of a lean colour replaces: 1, or 0 if it is additional
+    base_terms: int  # terms that the base of a reduced colour replaces: 1, or 0 if it is additional
     option: str  # option of `SceneConfig` for the number of terms,
     terms_of: Callable[[int], int]  # and the number of terms for its value
     # initial parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator; f_view is
     # that colour in every direction, or on average
     start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]]
-    lean_width: int  # numbers of a lean term
-    lean_limit: Limit  # of a lean term, allowed in a bundle
-    lean_formula: str  # evaluation of a lean colour, for bundle.json
-    lean_counts: Collection[int] = range(MAX_TERMS + 1)  # allowed numbers of lean terms of a surfel
+    reduced_width: int  # numbers of a reduced term
+    reduced_limit: Limit  # of a reduced term, allowed in a bundle
+    reduced_formula: str  # evaluation of a reduced colour, for bundle.json
+    reduced_counts: Collection[int] = range(MAX_TERMS + 1)  # allowed numbers of reduced terms of a surfel
     base_unit: float = 1.0  # colour for a base of 1
     # mean of f_view over all directions [N, 3] from the parameters, for display; None: no closed form
     mean: Callable[..., Tensor] | None = None
@@ -163,9 +163,9 @@ def _with_lobes(
         option="lobes",
         terms_of=int,
         start=start,
-        lean_width=len(limit),
-        lean_limit=limit,
-        lean_formula="view_base is the base colour, a term is a lobe",
+        reduced_width=len(limit),
+        reduced_limit=limit,
+        reduced_formula="view_base is the base colour, a term is a lobe",
         mean=mean,
     )
 
@@ -186,10 +186,10 @@ VIEW_COLORS: dict[str, ViewColor] = {
         option="sv_sites",
         terms_of=int,
         start=_sv_start,
-        lean_width=6,  # b, rgb relative to the first site
-        lean_limit=(*[VECTOR_LIMIT] * 3, *[COLOR_LIMIT] * 3),
-        lean_formula="(view_base + sum exp(b . d) rgb) / (1 + sum exp(b . d)); a term is b, rgb; d from the camera to "
-        "the surfel",
+        reduced_width=6,  # b, rgb relative to the first site
+        reduced_limit=(*[VECTOR_LIMIT] * 3, *[COLOR_LIMIT] * 3),
+        reduced_formula="(view_base + sum exp(b . d) rgb) / (1 + sum exp(b . d)); a term is b, rgb; d from the camera "
+        "to the surfel",
         sites=_sv_sites,
         stated="sites",
     ),
@@ -207,10 +207,10 @@ VIEW_COLORS: dict[str, ViewColor] = {
         option="sh_degree",
         terms_of=lambda degree: (degree + 1) ** 2,
         start=_sh_start,
-        lean_width=3,  # the coefficients of one function, from degree 1 on
-        lean_limit=_COLOR,
-        lean_counts=(0, 3, 8, 15),
-        lean_formula="view_base is the coefficient of degree 0, terms are those that follow",
+        reduced_width=3,  # the coefficients of one function, from degree 1 on
+        reduced_limit=_COLOR,
+        reduced_counts=(0, 3, 8, 15),
+        reduced_formula="view_base is the coefficient of degree 0, terms are those that follow",
         base_unit=SH_C0,
         mean=lambda dc, rest: dc * SH_C0,
     ),

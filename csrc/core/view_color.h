@@ -69,37 +69,37 @@ BT_HD Vec3<S> view_color_vjp(int K, const ViewColorArrays<const S>& p, int64_t i
   ViewColor::color_vjp(K, p.row(w, i), d, dc, dp.row(w, i), dd);
   return dd;
 }
-BT_HD int lean_width(int kind) {
-  return for_view_color(kind, [](auto view_color) { return view_color.kLeanWidth; });
+BT_HD int reduced_width(int kind) {
+  return for_view_color(kind, [](auto view_color) { return view_color.kReducedWidth; });
 }
-// Lean view colours: a base colour and a varying number of terms per surfel.
-template <class S> struct LeanColors {
+// Reduced view colours: a base colour and a varying number of terms per surfel.
+template <class S> struct ReducedColors {
   int kind;
-  const S *base, *terms;  // [n, 3], [all terms, lean_width(kind)]
+  const S *base, *terms;  // [n, 3], [all terms, reduced_width(kind)]
   const int32_t* span;    // [n, 2]: first term, number of terms
 
   template <class R> void fields(R& r, int64_t n, int64_t& count) {
     r.choice("kind", kind, ViewColorKinds::kNames);
     r.array("base", base, 3 * n);
     r.array("span", span, 2 * n);
-    r.rows("lean", terms, count, lean_width(kind));
+    r.rows("lean", terms, count, reduced_width(kind));
   }
 };
-template <class S> BT_HD Vec3<S> view_color(const LeanColors<S>& p, int64_t i, Vec3<S> d) {
+template <class S> BT_HD Vec3<S> view_color(const ReducedColors<S>& p, int64_t i, Vec3<S> d) {
   return for_view_color(p.kind, [&](auto view_color) {
-    constexpr int kWidth = decltype(view_color)::kLeanWidth;
-    return view_color.lean_color(p.span[2 * i + 1], p.base + 3 * i, p.terms + int64_t(p.span[2 * i]) * kWidth, d);
+    constexpr int kWidth = decltype(view_color)::kReducedWidth;
+    return view_color.reduced_color(p.span[2 * i + 1], p.base + 3 * i, p.terms + int64_t(p.span[2 * i]) * kWidth, d);
   });
 }
-// View colours of n surfels: whole, or lean if lean.base is not null.
+// View colours of n surfels: whole, or reduced if reduced.base is not null.
 template <class S> struct ViewColors {
   ViewColorArrays<const S> whole;
-  LeanColors<S> lean;
-  int64_t lean_terms;  // of all surfels
+  ReducedColors<S> reduced;
+  int64_t reduced_terms;  // of all surfels
 
   template <class R> void fields(R& r, int64_t n) {
     if (r.has("lean"))
-      lean.fields(r, n, lean_terms);
+      reduced.fields(r, n, reduced_terms);
     else
       whole.fields(r, n);
   }

@@ -31,13 +31,13 @@ template <class S> struct ViewColorRow {
 
 // Members of a kind's struct: name, fewest terms, and the preset's number of terms, for which kernels with unrolled
 // loops are compiled; parameter widths; the colour, and its vector-Jacobian product, which writes the gradients of the
-// parameters and adds to that of d; and the lean form: terms of kLeanWidth numbers, and the colour of a base and K
-// terms.
+// parameters and adds to that of d; and the reduced form: terms of kReducedWidth numbers, and the colour of a base and
+// K terms.
 
 // Spherical Voronoi. a = sites [K, 3], b = log tau [K], c = rgb [K, 3].
 struct SphericalVoronoi {
   static constexpr const char* kName = "sv";
-  static constexpr int kLeastTerms = 1, kPresetTerms = 7, kLeanWidth = 6;
+  static constexpr int kLeastTerms = 1, kPresetTerms = 7, kReducedWidth = 6;
   BT_HD static ViewColorWidths widths(int K) { return {3 * K, K, 3 * K}; }
 
   // c = sum_k softmax_k(tau_k s_k . d) rgb_k; softmax by log-sum-exp, so that any temperature is safe.
@@ -59,7 +59,7 @@ struct SphericalVoronoi {
   }
   // Relative to site 0, which then needs no direction: term k is b_k = tau_k s_k - tau_0 s_0 and rgb_k,
   // c = (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)); the base alone without terms.
-  template <class S> BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
+  template <class S> BT_HD static Vec3<S> reduced_color(int K, const S* base, const S* terms, Vec3<S> d) {
     Vec3<S> c = load3(base);
     if (K == 0) return c;
     S top = S(0);
@@ -109,9 +109,10 @@ struct SphericalVoronoi {
   }
 };
 
-// Lean form of a kind with unchanged terms. kInBase: number of terms in the base, 1 for spherical harmonics (degree 0).
+// Reduced form of a kind with unchanged terms. kInBase: number of terms in the base, 1 for spherical harmonics (degree
+// 0).
 template <class Kind, int kInBase = 0> struct StoredWhole {
-  template <class S> BT_HD static Vec3<S> lean_color(int K, const S* base, const S* terms, Vec3<S> d) {
+  template <class S> BT_HD static Vec3<S> reduced_color(int K, const S* base, const S* terms, Vec3<S> d) {
     return Kind::color(K + kInBase, ViewColorRow<const S>{base, terms, nullptr}, d);
   }
 };
@@ -167,7 +168,7 @@ template <class S> BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) 
 // Spherical harmonics with `terms` coefficients. a = dc [3], b = rest [terms - 1, 3].
 struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
   static constexpr const char* kName = "sh";
-  static constexpr int kLeastTerms = 1, kPresetTerms = 16, kLeanWidth = 3;
+  static constexpr int kLeastTerms = 1, kPresetTerms = 16, kReducedWidth = 3;
   BT_HD static ViewColorWidths widths(int terms) { return {3, 3 * (terms - 1), 0}; }
 
   template <class S> BT_HD static Vec3<S> color(int terms, ViewColorRow<const S> p, Vec3<S> d) {
@@ -221,7 +222,7 @@ template <class S> BT_HD BetaLobe<S> beta_lobe(const S* lobe, Vec3<S> d) {
 // Spherical Beta: c = base + sum of lobes. a = base [3], b = lobes [K, 6].
 struct SphericalBeta : StoredWhole<SphericalBeta> {
   static constexpr const char* kName = "sb";
-  static constexpr int kLeastTerms = 0, kPresetTerms = 2, kLeanWidth = 6;
+  static constexpr int kLeastTerms = 0, kPresetTerms = 2, kReducedWidth = 6;
   BT_HD static ViewColorWidths widths(int K) { return {3, 6 * K, 0}; }
 
   template <class S> BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
@@ -262,7 +263,7 @@ struct SphericalBeta : StoredWhole<SphericalBeta> {
 // normalised), log sharpness, r, g, b.
 struct SphericalGaussians : StoredWhole<SphericalGaussians> {
   static constexpr const char* kName = "sg";
-  static constexpr int kLeastTerms = 0, kPresetTerms = 2, kLeanWidth = 7;
+  static constexpr int kLeastTerms = 0, kPresetTerms = 2, kReducedWidth = 7;
   BT_HD static ViewColorWidths widths(int K) { return {3, 7 * K, 0}; }
 
   template <class S> BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {

@@ -14,8 +14,8 @@ namespace bt {
 namespace {
 template <class S> void check_terms(const ViewColors<S>& colors, int64_t n) {
   for (int64_t i = 0; i < n; ++i) {
-    const int64_t first = colors.lean.span[2 * i], count = colors.lean.span[2 * i + 1];
-    if (first < 0 || count < 0 || count > kMaxTerms || first + count > colors.lean_terms)
+    const int64_t first = colors.reduced.span[2 * i], count = colors.reduced.span[2 * i + 1];
+    if (first < 0 || count < 0 || count > kMaxTerms || first + count > colors.reduced_terms)
       throw std::invalid_argument("the terms of surfel " + std::to_string(i) + "'s view colour are not there");
   }
 }
@@ -73,9 +73,9 @@ template <class S> void view_color_forward(const ViewColorForward<S>& a) {
       store3(a.out + 3 * i, c);
     });
   };
-  if (a.colors.lean.base) {
+  if (a.colors.reduced.base) {
     check_terms(a.colors, a.to.n);
-    return write([&](int64_t i, Vec3<S> d) { return view_color(a.colors.lean, i, d); });
+    return write([&](int64_t i, Vec3<S> d) { return view_color(a.colors.reduced, i, d); });
   }
   const ViewColorArrays<const S>& p = a.colors.whole;
   for_view_color(p.kind, [&](auto kind) {

@@ -3,7 +3,7 @@
 //
 // One thread per surfel, 44 bytes in and, if visible, 100 out. A block then lists the pairs of its surfels from their
 // footprints in shared memory. View colours (196 bytes of parameters per surfel with seven sites, 20 + 24 per term of
-// lean ones) are computed for visible surfels only, by adjacent threads: a block compacts them.
+// reduced ones) are computed for visible surfels only, by adjacent threads: a block compacts them.
 //
 // There is no sort over all surfels or pairs, and tiles are found once. A pair takes the next slot of its tile,
 // by the tile's counter; when the slots are full, it goes to one list of all tiles. Each tile's list is sorted when the
@@ -125,7 +125,7 @@ __device__ void list_pairs(const BakedFrame& f, FootprintRoom* area, int owned, 
 
 // The presets' numbers of terms are constants, so that loops unroll and local memory is not used.
 __device__ Vec3<float> view_color_of(const BakedScene& s, int64_t i, Vec3<float> d) {
-  if (s.colors.lean.base) return view_color(s.colors.lean, i, d);
+  if (s.colors.reduced.base) return view_color(s.colors.reduced, i, d);
   const ViewColorArrays<const float>& p = s.colors.whole;
   return for_view_color(p.kind, [&](auto kind) {
     using Kind = decltype(kind);

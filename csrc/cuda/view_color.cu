@@ -10,7 +10,7 @@ namespace bt::cuda {
 namespace {
 constexpr int kThreads = 128;
 
-// kTerms: the number of terms, 0: that of the colours; without a kind the colours are lean: a single-colour surfel
+// kTerms: the number of terms, 0: that of the colours; without a kind the colours are reduced: a single-colour surfel
 // reads 20 bytes; each term 24 more (sv).
 template <class S, class ViewColor, int kTerms>
 __global__ void __launch_bounds__(kThreads) forward_kernel(ViewColorForward<S> a) {
@@ -20,7 +20,7 @@ __global__ void __launch_bounds__(kThreads) forward_kernel(ViewColorForward<S> a
   if (a.to.active[i]) {
     const Vec3<S> d = view_direction(a.to.means + 3 * i, a.to.center).n;
     if constexpr (std::is_void_v<ViewColor>)
-      c = view_color(a.colors.lean, i, d);
+      c = view_color(a.colors.reduced, i, d);
     else
       c = view_color<ViewColor>(kTerms ? kTerms : a.colors.whole.terms, a.colors.whole, i, d);
   }
@@ -59,7 +59,7 @@ template <class F> void dispatch(int kind, int terms, F&& f) {
 }  // namespace
 
 template <class S> void view_color_forward(const ViewColorForward<S>& a, Stream stream) {
-  if (a.colors.lean.base) {
+  if (a.colors.reduced.base) {
     BT_LAUNCH_EACH((forward_kernel<S, void, 0>), a.to.n, kThreads, stream, a);
     return;
   }

@@ -31,7 +31,7 @@ def write(
         surfels: N rows.
         tiles: [N, 5] int32; None: no tiles.
         atlas: encoded atlas.
-        kind: view-colour kind, required for lean colours.
+        kind: view-colour kind, required for reduced colours.
         options: of the scene and of `write_bundle`.
     """
     rows = torch.zeros(len(surfels["means"]), 5, dtype=torch.int32) if tiles is None else torch.from_numpy(tiles)

@@ -15,7 +15,7 @@ from bitymi_ns.bake.view_colors import ColorChoices, centers_of, color_choices, 
 from bitymi_ns.bundle import check_files, read_bundle
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.reference import view_color as reference
-from bitymi_ns.ops.view_color import LEAN, check_lean
+from bitymi_ns.ops.view_color import REDUCED, check_reduced
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.visibility import visibility
@@ -34,13 +34,15 @@ def views(n: int, count: int = 9, seed: int = 0, spread: float = 1.0) -> tuple[t
     return seen, centers.double()
 
 
-def exact_errors(kind, params, lean, means, seen, centers, opacity):
+def exact_errors(kind, params, reduced, means, seen, centers, opacity):
     found = torch.zeros(len(means), dtype=torch.float64)
     full = [params[name].double() for name in VIEW_COLORS[kind].names]
     for view, center in zip(seen, centers, strict=True):
         d = F.normalize(means.double() - center, dim=1)
         a = getattr(reference, kind)(*full, d)
-        b = reference.lean(kind, lean["view_base"].double(), lean["view_span"], lean["view_terms"].double(), d)
+        b = reference.reduced(
+            kind, reduced["view_base"].double(), reduced["view_span"], reduced["view_terms"].double(), d
+        )
         error = 255 * ((a + 0.5).relu() - (b + 0.5).relu()).abs().amax(1) * opacity
         found = torch.where(view, torch.maximum(found, error), found)
     return found
@@ -53,10 +55,10 @@ def test_the_bound_holds_in_every_view(surfels, kind, seed, tolerance, spread):
     params = surfels(n, kind, seed)
     means, opacity = params["means"], params["opacity_logits"].sigmoid()
     seen, centers = views(n, seed=seed, spread=spread)
-    lean = color_choices(params, kind, seen, centers, opacity, tolerance).at()
-    check_lean(kind, lean, n)
-    assert float(exact_errors(kind, params, lean, means, seen, centers, opacity).amax()) <= tolerance + 0.01
-    stated = view_color_errors(kind, params, lean, means, seen, centers, opacity)
+    reduced = color_choices(params, kind, seen, centers, opacity, tolerance).at()
+    check_reduced(kind, reduced, n)
+    assert float(exact_errors(kind, params, reduced, means, seen, centers, opacity).amax()) <= tolerance + 0.01
+    stated = view_color_errors(kind, params, reduced, means, seen, centers, opacity)
     assert float(stated.amax()) <= tolerance + 0.01  # also between the views, and all around an unseen surfel
 
 
@@ -82,17 +84,19 @@ def test_a_colour_that_no_view_sees_change_is_one_colour(surfels):
     n = 10
     params = surfels(n, "sv")
     params["sv_rgb"] = params["sv_rgb"][:, :1].expand(-1, 7, -1) + 1e-4 * params["sv_rgb"]
-    lean = color_choices(params, "sv", *views(n), torch.ones(n), 1.0).at()
-    assert (lean["view_span"][:, 1] == 0).all() and lean["view_terms"].shape == (0, 6)
-    torch.testing.assert_close(lean["view_base"], params["sv_rgb"].mean(1), atol=2e-3, rtol=0)
+    reduced = color_choices(params, "sv", *views(n), torch.ones(n), 1.0).at()
+    assert (reduced["view_span"][:, 1] == 0).all() and reduced["view_terms"].shape == (0, 6)
+    torch.testing.assert_close(reduced["view_base"], params["sv_rgb"].mean(1), atol=2e-3, rtol=0)
     for kind, lobes in (("sh", "sh_rest"), ("sg", "sg_lobes")):
         params = surfels(n, kind)
         params[lobes] = params[lobes] * 1e-5
-        lean = color_choices(params, kind, *views(n), torch.ones(n), 1.0).at()
-        assert (lean["view_span"][:, 1] == 0).all()
+        reduced = color_choices(params, kind, *views(n), torch.ones(n), 1.0).at()
+        assert (reduced["view_span"][:, 1] == 0).all()
         d = F.normalize(params["means"].double() - views(n)[1][0], dim=1)
         a = getattr(reference, kind)(*(params[name].double() for name in VIEW_COLORS[kind].names), d)
-        b = reference.lean(kind, lean["view_base"].double(), lean["view_span"], lean["view_terms"].double(), d)
+        b = reference.reduced(
+            kind, reduced["view_base"].double(), reduced["view_span"], reduced["view_terms"].double(), d
+        )
         torch.testing.assert_close(a.clamp(min=-0.5), b, atol=4e-3, rtol=0)
 
 
@@ -103,8 +107,8 @@ def test_sites_that_agree_are_merged(surfels):
     group = torch.tensor([0, 0, 0, 1, 1, 1])
     for name in VIEW_COLORS["sv"].names:
         params[name] = params[name][:, group].contiguous()
-    lean = color_choices(params, "sv", *views(n), torch.ones(n), 0.05).at()
-    assert (lean["view_span"][:, 1] <= 1).all()
+    reduced = color_choices(params, "sv", *views(n), torch.ones(n), 0.05).at()
+    assert (reduced["view_span"][:, 1] <= 1).all()
 
 
 def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
@@ -112,17 +116,19 @@ def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
     params = surfels(n, "sv")
     params["sv_rgb"] *= 10
     seen, centers = views(n, spread=5.0)
-    lean = color_choices(params, "sv", seen, centers, torch.ones(n), 1e-3).at()
+    reduced = color_choices(params, "sv", seen, centers, torch.ones(n), 1e-3).at()
     rest = torch.arange(n) != 1
-    assert (lean["view_span"][rest, 1] == 6).all()
+    assert (reduced["view_span"][rest, 1] == 6).all()
     d = F.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(1)), dim=1).double()
     want = reference.sv(*(params[name].double() for name in VIEW_COLORS["sv"].names), d)
-    got = reference.lean("sv", lean["view_base"].double(), lean["view_span"], lean["view_terms"].double(), d)
+    got = reference.reduced(
+        "sv", reduced["view_base"].double(), reduced["view_span"], reduced["view_terms"].double(), d
+    )
     torch.testing.assert_close(got[rest], want[rest], atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera, tmp_path, kind):
+def test_a_bundle_holds_the_reduced_colours_and_verify_measures_them(scene, camera, tmp_path, kind):
     made, cameras = scene(60, None, kind), [camera(3.0), camera(4.0)]
     options = BakeOptions(format="uint8", tolerance=2.0)
     baked = bake_field(made, cameras, options)
@@ -130,7 +136,7 @@ def test_a_bundle_holds_the_lean_colours_and_verify_measures_them(scene, camera,
     bundle, checks = check_files(tmp_path / "b")
     assert all(check.ok for check in checks) and bundle.scene.view_color == kind
     assert bundle.info.version == "6.0" and bundle.info.surfels.terms == len(bundle.scene.surfels["view_terms"])
-    for name in LEAN:
+    for name in REDUCED:
         assert torch.equal(bundle.scene.surfels[name], baked.scene.surfels[name])
     stated = bundle.info.statistics.view_color.model_dump()
     assert stated["error"]["p100"] <= 2.0 and stated["sites"]["after"] < stated["sites"]["before"]
@@ -204,7 +210,7 @@ def test_the_price_decides_from_all_terms_to_none(colored, cameras, kind: str) -
     counts = []
     for price in (None, 1e-4, 1e-2, 1e6):
         colors = choices.at(price)
-        check_lean(kind, colors, COUNT)
+        check_reduced(kind, colors, COUNT)
         counts.append(len(colors["view_terms"]))
         assert with_colors(scene, colors).render(cameras[0], BACKGROUND).rgb.isfinite().all()
     assert counts == sorted(counts, reverse=True) and counts[-1] == 0 and counts[0] > COUNT

@@ -17,7 +17,7 @@ from bitymi_ns.codec.texel_codes import SceneCodes, TexelCoder, mean_alphas_of
 from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from bitymi_ns.scene.baked import BakedScene
-from tests.ops.test_view_color import lean_parameters
+from tests.ops.test_view_color import reduced_parameters
 
 SIDES = ((8, 4), (0, 0), (4, 4), (16, 8))
 RANGE = Range(-0.5, 2.0, "test")
@@ -37,7 +37,7 @@ def make_codes(
     """Build SceneCodes of random surfels, every fourth without a tile, with alpha texels or opaque."""
     params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
     params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
-    params |= lean_parameters(kind, count, torch.float32)
+    params |= reduced_parameters(kind, count, torch.float32)
     sizes = torch.tensor([SIDES[i % len(SIDES)] if textured else (0, 0) for i in range(count)])
     surfels, order = code_surfels(params, kind, sizes, torch.linspace(0.5, 3.0, count), steps)
     sizes = sizes[order]

@@ -133,7 +133,7 @@ def test_a_lack_of_memory_is_a_sentence(surfels, tmp_path, monkeypatch):
     assert "needs more memory" in check_files(folder)[1][-1].detail
 
 
-# kind, lean, element, column, a value just within the limit, one beyond it
+# kind, reduced, element, column, a value just within the limit, one beyond it
 COLUMNS = [
     ("sv", False, "vertex", "y", 1e9, -1.1e9),
     ("sv", False, "vertex", "scale_1", -104, 105),
@@ -161,9 +161,11 @@ COLUMNS = [
 ]
 
 
-@pytest.mark.parametrize("kind, lean, element, column, good, bad", COLUMNS, ids=lambda value: str(value))
-def test_values_beyond_limits_are_refused_by_column_and_row(surfels, tmp_path, kind, lean, element, column, good, bad):
-    folder = make(surfels, tmp_path / "b", kind, lean=lean, alpha=column == "alpha")
+@pytest.mark.parametrize("kind, reduced, element, column, good, bad", COLUMNS, ids=lambda value: str(value))
+def test_values_beyond_limits_are_refused_by_column_and_row(
+    surfels, tmp_path, kind, reduced, element, column, good, bad
+):
+    folder = make(surfels, tmp_path / "b", kind, reduced=reduced, alpha=column == "alpha")
     change_columns(folder, lambda columns: columns[column].__setitem__(2, good), element)
     read_bundle(folder)
     change_columns(folder, lambda columns: columns[column].__setitem__(2, bad), element)

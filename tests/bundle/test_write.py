@@ -49,10 +49,10 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
     assert loaded.info.atlas.psnr == pytest.approx(atlas.psnr)
 
 
-@pytest.mark.parametrize("lean", [False, True])
+@pytest.mark.parametrize("reduced", [False, True])
 @pytest.mark.parametrize("format", ["bc7", "uint8", "fp16"])
-def test_alphas_are_read_as_they_were_written(surfels, tmp_path, format, lean):
-    _, _, texels, atlas = make(surfels, tmp_path / "b", "sh", format, lean=lean, alpha=True)
+def test_alphas_are_read_as_they_were_written(surfels, tmp_path, format, reduced):
+    _, _, texels, atlas = make(surfels, tmp_path / "b", "sh", format, reduced=reduced, alpha=True)
     loaded = read_bundle(tmp_path / "b")
     assert loaded.info.version == "6.0" and loaded.scene.alpha_scale == loaded.info.atlas.alpha_scale
     torch.testing.assert_close(loaded.scene.mean_alpha, torch.linspace(0, 2, 6), rtol=0, atol=0)
@@ -66,20 +66,20 @@ def test_alphas_are_read_as_they_were_written(surfels, tmp_path, format, lean):
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-def test_lean_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
-    params, *_ = make(surfels, tmp_path / "b", kind, None, lean=True)
+def test_reduced_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
+    params, *_ = make(surfels, tmp_path / "b", kind, None, reduced=True)
     loaded = read_bundle(tmp_path / "b")
     assert loaded.scene.view_color == kind and loaded.info.version == "6.0"
     assert set(loaded.scene.surfels) == set(params)
     d = torch.nn.functional.normalize(params["means"], dim=1)
-    want = reference.lean(kind, params["view_base"], params["view_span"], params["view_terms"], d)
-    got = reference.lean(kind, *(loaded.scene.surfels[name] for name in ("view_base", "view_span", "view_terms")), d)
+    want = reference.reduced(kind, params["view_base"], params["view_span"], params["view_terms"], d)
+    got = reference.reduced(kind, *(loaded.scene.surfels[name] for name in ("view_base", "view_span", "view_terms")), d)
     assert torch.equal(got, want)  # the terms are in the order of the surfels now
 
 
-def test_lean_view_colours_that_do_not_fit_are_refused(surfels, tmp_path):
+def test_reduced_view_colours_that_do_not_fit_are_refused(surfels, tmp_path):
     target = tmp_path / "b"
-    params, *_ = make(surfels, target, format=None, lean=True)
+    params, *_ = make(surfels, target, format=None, reduced=True)
     with pytest.raises(BundleError, match="surfel 2"):
         bad = {**params, "view_span": params["view_span"].clone()}
         bad["view_span"][2, 1] = 99

@@ -8,7 +8,7 @@ from bitymi_ns import ops
 from tests.cuda.conftest import in_orders
 from tests.ops.golden import reference_ssim
 from tests.ops.test_kernels import relative
-from tests.ops.test_view_color import lean_parameters
+from tests.ops.test_view_color import reduced_parameters
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 TERMS = {"sv": (7, 3), "sh": (16, 4), "sb": (2, 5), "sg": (2, 3)}
@@ -49,15 +49,15 @@ def test_view_colors_and_gradients_against_the_cpu(kind: str, terms: int, dtype:
 
 @DTYPES
 @pytest.mark.parametrize("kind", list(TERMS))
-def test_lean_view_colors_against_the_cpu(kind: str, dtype: torch.dtype, device: torch.device, cpu) -> None:
+def test_reduced_view_colors_against_the_cpu(kind: str, dtype: torch.dtype, device: torch.device, cpu) -> None:
     n = 150
     g = torch.Generator().manual_seed(1)
     means, center = torch.randn(n, 3, generator=g, dtype=dtype), torch.randn(3, generator=g)
-    active, lean = torch.rand(n, generator=g) > 0.3, lean_parameters(kind, n, dtype)
-    there = {name: value.to(device) for name, value in lean.items()}
+    active, reduced = torch.rand(n, generator=g) > 0.3, reduced_parameters(kind, n, dtype)
+    there = {name: value.to(device) for name, value in reduced.items()}
     got = ops.view_color(kind, there, means.to(device), center.to(device), active.to(device)).cpu()
     with cpu():
-        want = ops.view_color(kind, lean, means, center, active)
+        want = ops.view_color(kind, reduced, means, center, active)
     assert relative(got.double(), want.double()) < (1e-12 if dtype == torch.float64 else 2e-5)
     assert not got[~active].any()
 

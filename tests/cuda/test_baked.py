@@ -42,7 +42,7 @@ from tests.cuda.baked_scenes import (
 )
 from tests.cuda.conftest import in_orders
 from tests.ops.golden import SceneCase, atlas_of, extreme_scenes, load_golden, random_scene
-from tests.ops.test_view_color import lean_parameters
+from tests.ops.test_view_color import reduced_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 STEP = 1 / 255
@@ -148,11 +148,11 @@ def test_opaque_alpha_texels_change_nothing(device: torch.device) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-def test_view_colours_full_and_lean(kind: str, device: torch.device, cpu) -> None:
+def test_view_colours_full_and_reduced(kind: str, device: torch.device, cpu) -> None:
     scene = textured(40, 1, kind=kind)
     check(scene, front(), device, cpu)
     geometry = {k: v for k, v in scene.surfels.items() if k not in VIEW_COLORS[kind].names}
-    scene.surfels = geometry | lean_parameters(kind, 40, torch.float32)
+    scene.surfels = geometry | reduced_parameters(kind, 40, torch.float32)
     check(scene, front(), device, cpu)
     scene.surfels["view_span"][7, 1] = 33
     with pytest.raises(ValueError, match="surfel 7"):

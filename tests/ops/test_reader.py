@@ -69,9 +69,13 @@ def test_names_that_are_known_and_objects_of_the_module() -> None:
         kernels.view_color_forward_f32(kind="fancy", **to, **colors)
     with pytest.raises(TypeError, match="field must be an object of this module, not .*str"):
         kernels.field_forward_f32(field="none", x=torch.zeros(1, 3), rho=torch.zeros(1, 3))
-    lean = {"span": torch.tensor([[0, 2]] * n, dtype=torch.int32), "lean": torch.zeros(1, 6), "out": torch.zeros(n, 3)}
+    reduced = {
+        "span": torch.tensor([[0, 2]] * n, dtype=torch.int32),
+        "lean": torch.zeros(1, 6),
+        "out": torch.zeros(n, 3),
+    }
     with pytest.raises(ValueError, match="the terms of surfel 0's view colour are not there"):
-        kernels.view_color_forward_f32(kind="sv", **to, base=torch.zeros(n, 3), **lean)
+        kernels.view_color_forward_f32(kind="sv", **to, base=torch.zeros(n, 3), **reduced)
 
 
 def test_a_pool_gives_what_is_idle_and_forgets_what_failed() -> None:

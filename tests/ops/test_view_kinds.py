@@ -8,7 +8,7 @@ import yaml
 
 from bitymi_ns import ops
 from bitymi_ns.ops.reference import view_color as reference
-from bitymi_ns.ops.view_color import check_lean, check_view_color
+from bitymi_ns.ops.view_color import check_reduced, check_view_color
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, Kind, kind_of
 from bitymi_ns.presets import preset_dir
 from bitymi_ns.scene.config import SceneConfig
@@ -41,26 +41,26 @@ def test_an_entry_agrees_with_itself_the_kernels_and_the_twin(kind: str) -> None
     for parameter in entry.parameters:
         assert len(parameter.limit) in (1, parameter.shape[-1]) and 0 < parameter.rate_factor <= 1
         assert hasattr(LearningRates(), parameter.rate)
-    assert len(entry.lean_limit) in (1, entry.lean_width)
-    if entry.sites is None:  # the lean colour has the same parameters
+    assert len(entry.reduced_limit) in (1, entry.reduced_width)
+    if entry.sites is None:  # the reduced colour has the same parameters
         first, second = entry.parameters
-        assert first.shape == (3,) and second.width == entry.lean_width and second.limit == entry.lean_limit
+        assert first.shape == (3,) and second.width == entry.reduced_width and second.limit == entry.reduced_limit
 
 
 @pytest.mark.parametrize("kind", list(VIEW_COLORS))
 def test_a_base_of_one_shows_its_unit_and_whole_numbers_of_terms_are_taken(kind: str) -> None:
     entry = VIEW_COLORS[kind]
-    lean = {"view_base": torch.ones(1, 3), "view_span": torch.zeros(1, 2).int()}
-    lean["view_terms"] = torch.zeros(max(entry.lean_counts) + 1, entry.lean_width)
-    color = ops.view_color(kind, lean, torch.rand(1, 3), torch.zeros(3))
+    reduced = {"view_base": torch.ones(1, 3), "view_span": torch.zeros(1, 2).int()}
+    reduced["view_terms"] = torch.zeros(max(entry.reduced_counts) + 1, entry.reduced_width)
+    color = ops.view_color(kind, reduced, torch.rand(1, 3), torch.zeros(3))
     torch.testing.assert_close(color, torch.full((1, 3), entry.base_unit))
-    for count in range(-1, max(entry.lean_counts) + 2):
-        lean["view_span"] = torch.tensor([[0, count]]).int()
-        if count in entry.lean_counts:
-            check_lean(kind, lean, 1)
+    for count in range(-1, max(entry.reduced_counts) + 2):
+        reduced["view_span"] = torch.tensor([[0, count]]).int()
+        if count in entry.reduced_counts:
+            check_reduced(kind, reduced, 1)
         else:
             with pytest.raises(ValueError, match="surfel 0"):
-                check_lean(kind, lean, 1)
+                check_reduced(kind, reduced, 1)
 
 
 def test_every_kind_has_a_preset() -> None:

@@ -21,10 +21,10 @@ def test_floor_box_and_hidden_boxes_hide_together() -> None:
     assert Crop(box, floor, (hidden,)).keeps(points).tolist() == [False, True, False, True, False]
 
 
-@pytest.mark.parametrize(("lean", "alpha"), [(False, False), (True, False), (False, True)])
-def test_surfels_that_are_left_out_are_not_drawn(surfels, camera, tmp_path: Path, lean: bool, alpha: bool) -> None:
+@pytest.mark.parametrize(("reduced", "alpha"), [(False, False), (True, False), (False, True)])
+def test_surfels_that_are_left_out_are_not_drawn(surfels, camera, tmp_path: Path, reduced: bool, alpha: bool) -> None:
     more = {"mean_residual": torch.rand(12, 3)}
-    make(surfels, tmp_path / "b", count=12, lean=lean, alpha=alpha, **more)
+    make(surfels, tmp_path / "b", count=12, reduced=reduced, alpha=alpha, **more)
     scene = read_bundle(tmp_path / "b").scene
     kept = torch.arange(12) % 3 > 0
     some = scene.only(kept)

@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 
 MORE = int(os.environ.get("BITYMI_FUZZ", "1"))
 EXAMPLES = 60 * MORE
-FORMATS = ("bc7", "uint8", "fp16", "lean")
+FORMATS = ("bc7", "uint8", "fp16", "reduced")
 N, SIDE = 12, 16
 FINITE = [value for value in ODD_VALUES if not isinstance(value, float) or math.isfinite(value)]
 
@@ -36,8 +36,8 @@ def bundle(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
         return {key: value.float() for key, value in random_scene(count, 0).params.items()}
 
     folder = tmp_path_factory.mktemp("bundles") / request.param
-    lean = request.param == "lean"
-    make(surfels, folder, format="uint8" if lean else request.param, count=N, lean=lean)
+    reduced = request.param == "reduced"
+    make(surfels, folder, format="uint8" if reduced else request.param, count=N, reduced=reduced)
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 

@@ -31,7 +31,7 @@ CASES = {
     "sb all": {"kind": "sb", **ALL},
     "sg compact": {"kind": "sg", **COMPACT},
 }
-"""Every kind, with all terms or lean; tests/ops/webgpu has both for each."""
+"""Every kind, with all terms or reduced; tests/ops/webgpu has both for each."""
 CASES |= {"sv alpha": {"alpha": True}, "sv alpha compact": {"alpha": True, "seen": True, **COMPACT}}
 ELSEWHERE = ("sv compact",)  # in a browser: test_browser.py
 CASES |= {"near 3, colour": {"near": 3.0, "background": (0.2, 0.5, 0.9), **COMPACT}}

@@ -4,7 +4,7 @@ import { readCompactSurfels } from '../src/bundle/compact/surfels';
 import { readCompactTexels } from '../src/bundle/compact/texels';
 import { parseManifest } from '../src/bundle/manifest';
 import { alphaIn, layerIn } from '../src/bundle/surfels';
-import { KINDS, LEAN_WIDTH, SURFEL_WORDS, WORD } from '../src/bundle/tables';
+import { KINDS, REDUCED_WIDTH, SURFEL_WORDS, WORD } from '../src/bundle/tables';
 import { DamagedBundle } from '../src/errors';
 import { BUNDLES, EARLIER, type Written, bytes, floats, ints } from './compact_bundles';
 
@@ -54,7 +54,7 @@ describe.each(WRITTEN)('the compact bundle %s of version %s', (_, version, { fil
       const [x, y, word] = [WORD.tile, WORD.tile + 1, WORD.layer].map((at) => numbers[row + at]);
       if ('mean_alpha' in scene) expect(alphaIn(word)).toBe(floats(scene.mean_alpha)[i]);
       expect([x, y, layerIn(word), sides & 0xffff, sides >>> 16]).toEqual([...tiles.subarray(5 * i, 5 * i + 5)]);
-      const first = numbers[row + WORD.firstTerm] / LEAN_WIDTH[info.viewColor];
+      const first = numbers[row + WORD.firstTerm] / REDUCED_WIDTH[info.viewColor];
       expect([first, numbers[row + WORD.terms]]).toEqual([...span.subarray(2 * i, 2 * i + 2)]);
     }
   });

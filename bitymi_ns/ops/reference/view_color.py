@@ -107,8 +107,8 @@ def sg(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
     return base + (lobes[..., 4:] * falloff[..., None]).sum(1)
 
 
-def lean(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> Tensor:
-    """Evaluate lean view colours, with a varying number of terms per surfel; without terms the base colour.
+def reduced(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> Tensor:
+    """Evaluate reduced view colours, with a varying number of terms per surfel; without terms the base colour.
 
     sv: (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)), a term is b, rgb: Spherical Voronoi relative to
     its first site. sh: base is dc, terms are the coefficients from degree 1 on. sb, sg: base plus lobes.

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..baked_scene import BakedSceneLike
 from ..constants import SUPPORT
 from ..parameters import GEOMETRY
-from ..view_color import LEAN, check_lean, check_view_color
+from ..view_color import REDUCED, check_reduced, check_view_color
 from ..view_kinds import VIEW_COLORS
 
 WHOLE = " sites"  # suffix of a kind's form with all sites and no base
@@ -109,8 +109,8 @@ def _set_tiles(surfels: npt.NDArray, scene: BakedSceneLike) -> None:
 def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, Tensor, Tensor]:
     """Return the form, base [N, 3], first term and number of terms [N, 2], and terms."""
     if "view_terms" in p:
-        check_lean(kind, p, n)
-        base, span, terms = (p[name] for name in LEAN)
+        check_reduced(kind, p, n)
+        base, span, terms = (p[name] for name in REDUCED)
         first, count = span.long().unbind(1)
         return kind, base, torch.stack([first * terms.shape[1], count], dim=1), terms
     check_view_color(kind, p, n)

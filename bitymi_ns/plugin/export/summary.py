@@ -100,24 +100,24 @@ def print_savings(table: Table, baked: Coded, info: Manifest) -> None:
 
 
 def print_view_color(table: Table, info: Manifest) -> None:
-    lean, stored = info.statistics.view_color, info.files[info.surfels.file].bytes
-    if lean is None:
+    reduced, stored = info.statistics.view_color, info.files[info.surfels.file].bytes
+    if reduced is None:
         table.add_row("View colour", "all of it is kept")
         table.add_row("Surfel bytes", f"{stored:,}")
         return
-    sites, count, error = lean.sites, info.surfels.count, lean.error
+    sites, count, error = reduced.sites, info.surfels.count, reduced.error
     if sites.before:
         saved = f"{sites.before:,} -> {sites.after:,} ({100 * sites.after / sites.before:.1f} %)"
         table.add_row(VIEW_COLORS[info.surfels.view_color].kept, saved)
-    table.add_row("Surfels of one colour", f"{lean.one_color:,} ({100 * lean.one_color / count:.1f} %)")
-    if info.surfels.columns is None and lean.bytes is not None and lean.bytes.before is not None:
-        whole = stored + lean.bytes.before - lean.bytes.after
+    table.add_row("Surfels of one colour", f"{reduced.one_color:,} ({100 * reduced.one_color / count:.1f} %)")
+    if info.surfels.columns is None and reduced.bytes is not None and reduced.bytes.before is not None:
+        whole = stored + reduced.bytes.before - reduced.bytes.after
         table.add_row("Surfel bytes", f"{whole:,} -> {stored:,} ({100 * stored / whole:.1f} %)")
     else:
         table.add_row("Surfel bytes", f"{stored:,} ({stored / max(1, count):.1f} per surfel)")
     median, high, most = map(steps_text, (error.p50, error.p99, error.p100))
     table.add_row("Error of a view colour", f"median {median}, 99 % {high}, at most {most} steps")
-    table.add_row("", f"(tolerance {lean.tolerance:g}; weighted, largest over directions and channels)")
+    table.add_row("", f"(tolerance {reduced.tolerance:g}; weighted, largest over directions and channels)")
 
 
 def print_tuning(table: Table, name: str, tuned: FineTuning) -> None:

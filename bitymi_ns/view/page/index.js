@@ -778,7 +778,7 @@ fn scatter(@builtin(local_invocation_index) thread: u32, @builtin(workgroup_id) 
 }
 `,He=`// View colours f_view(d), without the offset 0.5, from a base and terms, as core/view_kinds.h.
 
-const VIEW_SV: u32 = 0;  // lean: b, rgb
+const VIEW_SV: u32 = 0;  // reduced: b, rgb
 const VIEW_SV_SITES: u32 = 1;  // all sites: site, log temperature, rgb
 const VIEW_SH: u32 = 2;  // coefficients from degree 1 on: rgb
 const VIEW_SB: u32 = 3;  // lobes: rgb, theta, phi, b

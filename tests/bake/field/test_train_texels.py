@@ -82,13 +82,13 @@ def test_everything_learns_and_the_gain_is_what_is_stated(wrong: Trained, views:
 def test_view_colours_are_reduced_afterwards_and_can_be_tuned(wrong: Trained, views: list[View]) -> None:
     polished = polish_scene(wrong, views[:10], BACKGROUND, OPTIONS)
     polished.scene.surfels["opacity_logits"][5] = -9.0  # no longer drawn
-    lean = prune_and_resample(polished, [v.camera for v in views[:10]])
-    assert "view_terms" in lean.scene.surfels and lean.statistics.view_color.error.p100 <= 0.76
-    left = lean.statistics.surfels
+    reduced = prune_and_resample(polished, [v.camera for v in views[:10]])
+    assert "view_terms" in reduced.scene.surfels and reduced.statistics.view_color.error.p100 <= 0.76
+    left = reduced.statistics.surfels
     assert (left.kept, left.left_out.transparent, left.left_out.unseen) == (58, 1, 1)
-    assert lean.rows.tolist() == [i for i in range(60) if i not in (5, 59)]
-    assert db(lean, views[10:]) == pytest.approx(db(polished, views[10:]), abs=0.1)
-    again = tune_atlas(lean, views[:10], BACKGROUND, TuneOptions(steps=8, coded_steps=0, patience=8))
+    assert reduced.rows.tolist() == [i for i in range(60) if i not in (5, 59)]
+    assert db(reduced, views[10:]) == pytest.approx(db(polished, views[10:]), abs=0.1)
+    again = tune_atlas(reduced, views[:10], BACKGROUND, TuneOptions(steps=8, coded_steps=0, patience=8))
     assert again.statistics.polish == polished.statistics.polish and again.statistics.finetune.steps == 8
 
 

@@ -26,7 +26,7 @@ from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import FAR, camera_of, front, layered, scene_of, textured, to_average
 from tests.ops.golden import GOLDEN_NAMES, SceneCase, atlas_of, crossing_scene, extreme_scenes, load_golden, reference
-from tests.ops.test_view_color import lean_parameters
+from tests.ops.test_view_color import reduced_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")
 PICTURE = ("rgb", "alpha", "beta", "depth")
@@ -117,12 +117,12 @@ def test_discs_far_larger_than_their_depth_are_drawn_whole(seed: int) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
-@pytest.mark.parametrize("lean", [False, True], ids=["all terms", "lean"])
-def test_view_colours(kind: str, lean: bool) -> None:
+@pytest.mark.parametrize("reduced", [False, True], ids=["all terms", "reduced"])
+def test_view_colours(kind: str, reduced: bool) -> None:
     scene = replace(textured(40, 1, kind=kind), weight_bound=0.0)
-    if lean:
+    if reduced:
         scene.surfels = {k: v for k, v in scene.surfels.items() if k not in VIEW_COLORS[kind].names}
-        scene.surfels |= lean_parameters(kind, 40, torch.float32)
+        scene.surfels |= reduced_parameters(kind, 40, torch.float32)
     assert check(scene, front()).mean() < 0.1 * STEP
 
 

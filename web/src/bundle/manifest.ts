@@ -1,9 +1,9 @@
 // The part of bundle.json that the viewer needs; bitymi_ns/bundle/manifest.py has the whole schema.
 import { DamagedBundle, ViewerError } from '../errors';
 import type { Column } from './compact/columns';
-import { EARLIER, EXTENT, FORMAT, LEAN_WIDTH, NEWEST_MAJOR, RANGES } from './tables';
+import { EARLIER, EXTENT, FORMAT, REDUCED_WIDTH, NEWEST_MAJOR, RANGES } from './tables';
 
-export type ViewKind = keyof typeof LEAN_WIDTH;
+export type ViewKind = keyof typeof REDUCED_WIDTH;
 export type AtlasFormat = 'bc7' | 'uint8' | 'fp16';
 export type Vec3 = [number, number, number];
 
@@ -193,7 +193,7 @@ export function parseManifest(text: string) {
   return {
     version,
     count: surfels.whole('count'),
-    viewColor: surfels.choice('view_color', Object.keys(LEAN_WIDTH) as ViewKind[]),
+    viewColor: surfels.choice('view_color', Object.keys(REDUCED_WIDTH) as ViewKind[]),
     terms: surfels.has('terms') || isCompact ? surfels.whole('terms') : null,
     compact: isCompact ? compact(surfels) : null, // if in surfels.bin
     atlas: texture,

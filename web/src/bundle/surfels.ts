@@ -6,7 +6,7 @@ import {
   EXTENT,
   EXTENTS,
   KINDS,
-  LEAN_WIDTH,
+  REDUCED_WIDTH,
   LIMITS,
   MAX_TERMS,
   PLY,
@@ -65,8 +65,8 @@ export function setTerms(words: Float32Array, counts: ArrayLike<number>, width: 
   return first;
 }
 
-function lean(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): Float32Array {
-  const width = LEAN_WIDTH[kind];
+function reduced(rows: Table, terms: Table, words: Float32Array, kind: ViewKind): Float32Array {
+  const width = REDUCED_WIDTH[kind];
   for (let c = 0; c < 3; c++) rows.into(`view_base_${c}`, words, WORD.base + c, SURFEL_WORDS);
   const counts = new Int32Array(rows.count);
   rows.into('view_terms', counts, 0, 1);
@@ -174,7 +174,7 @@ export function readSurfels(data: ArrayBuffer, info: Manifest): Surfels {
   const term = elements.get('view_term');
   const form = WHOLE[info.viewColor];
   const terms = term
-    ? lean(rows, new Table(data, term, 'view_term'), words, info.viewColor)
+    ? reduced(rows, new Table(data, term, 'view_term'), words, info.viewColor)
     : whole(rows, words, Object.entries(form.parts), form.base);
   checkLimits(words, terms, TERM_LIMITS[info.viewColor === 'sv' && !term ? 'sv sites' : info.viewColor]);
   const origin = originOf(info);

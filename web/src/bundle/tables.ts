@@ -43,8 +43,8 @@ export const LINEAR: Record<string, { words: readonly number[]; limit: number } 
   beta: { words: [10], limit: 1e4, least: 0.0009765625, absent: null },
 };
 export const KINDS = { sv: 0, 'sv sites': 1, sh: 2, sb: 3, sg: 4 } as const;
-export const LEAN_WIDTH = { sv: 6, sh: 3, sb: 6, sg: 7 } as const;
-export const LEAN_COUNTS: Record<string, readonly number[] | null> = {
+export const REDUCED_WIDTH = { sv: 6, sh: 3, sb: 6, sg: 7 } as const;
+export const REDUCED_COUNTS: Record<string, readonly number[] | null> = {
   sv: null, sh: [0, 3, 8, 15], sb: null, sg: null,
 };
 export const TERM_LIMITS = {

@@ -1,6 +1,6 @@
 // Limits of the device, checked before a scene is decoded.
 import type { Atlas, Manifest } from '../bundle/manifest';
-import { LEAN_WIDTH, SURFEL_WORDS } from '../bundle/tables';
+import { REDUCED_WIDTH, SURFEL_WORDS } from '../bundle/tables';
 import { tooLarge } from '../errors';
 
 const DECODED_NUMBERS = 19; // doubles per surfel while a compact bundle is decoded, without terms
@@ -23,7 +23,7 @@ const texelsOf = (atlas: Atlas): number => atlas.width * atlas.height * atlas.la
 
 // Estimates the page's peak memory, bytes, from below.
 export function pageBytes({ count, terms, viewColor, compact, atlas, files }: Manifest): number {
-  const width = LEAN_WIDTH[viewColor];
+  const width = REDUCED_WIDTH[viewColor];
   const words = 4 * (SURFEL_WORDS * count + width * (terms ?? 0));
   if (compact) {
     const decoded = 8 * (DECODED_NUMBERS * count + width * (terms ?? 0));
@@ -36,7 +36,7 @@ export function pageBytes({ count, terms, viewColor, compact, atlas, files }: Ma
 // Rejects a scene that exceeds the device's limits, by its bundle.json.
 export function checkRoom(info: Manifest, limits: Limits, gigabytes = UNKNOWN_MEMORY): void {
   const { count, terms, viewColor, atlas } = info;
-  const largest = Math.max(4 * SURFEL_WORDS * count, 4 * LEAN_WIDTH[viewColor] * (terms ?? 0));
+  const largest = Math.max(4 * SURFEL_WORDS * count, 4 * REDUCED_WIDTH[viewColor] * (terms ?? 0));
   const side = atlas ? Math.max(atlas.width, atlas.height) : 0;
   const layers = atlas?.layers ?? 0;
   const fits =

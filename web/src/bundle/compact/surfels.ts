@@ -9,8 +9,8 @@ import {
   EXTENTS,
   KINDS,
   LATER,
-  LEAN_COUNTS,
-  LEAN_WIDTH,
+  REDUCED_COUNTS,
+  REDUCED_WIDTH,
   LIMITS,
   LINEAR,
   MAX_TERMS,
@@ -39,7 +39,7 @@ function expected({ viewColor: kind, atlas, compact }: Manifest): [string, numbe
   const shapes = SHAPES[kind].limits.length;
   const terms: [string, number][] = [
     ['term_shape', shapes],
-    ['term_color', LEAN_WIDTH[kind] - shapes],
+    ['term_color', REDUCED_WIDTH[kind] - shapes],
   ];
   return [...Object.entries(COLUMNS).filter(([name]) => !lacking(name)), ...terms];
 }
@@ -198,7 +198,7 @@ class Decoder {
   private viewColors(): Float32Array {
     const kind = this.info.viewColor;
     const [[counts], shape, colors] = ['view_count', 'term_shape', 'term_color'].map((name) => this.column(name));
-    const [allowed, width] = [LEAN_COUNTS[kind], LEAN_WIDTH[kind]];
+    const [allowed, width] = [REDUCED_COUNTS[kind], REDUCED_WIDTH[kind]];
     if (!counts.every((count) => (allowed ? allowed.includes(count) : count >= 0 && count <= MAX_TERMS))) {
       this.refuse('a view colour has a number of terms that none can have');
     }

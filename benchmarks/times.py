@@ -27,11 +27,10 @@ from bitymi_ns.measure.bench.cli import BenchRun
 from bitymi_ns.measure.bench.process import BenchError, say
 from bitymi_ns.measure.markdown import number, page, publish, table
 from bitymi_ns.ops.backend import emulated_cuda
-from bitymi_ns.ops.baked_cuda import Stage
+from bitymi_ns.ops.baked_renderer import BakedRenderer, Stage
 from bitymi_ns.ops.constants import SUPPORT
 from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.scene.baked_renderer import BakedRenderer
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField, TexelField
 

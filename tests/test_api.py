@@ -29,7 +29,7 @@ from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.reference.project import Projection
 from bitymi_ns.ops.reference.project import project as reference_project
 from bitymi_ns.ops.reference.render import render as reference_render
-from bitymi_ns.scene.baked_renderer import SceneRenderer
+from bitymi_ns.scene.scene_renderer import SceneRenderer
 from tests.cuda.conftest import why_not_emulated
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from . import baked_cpu, baked_cuda, webgpu
+from . import baked_cpu, webgpu
 from .backend import cuda_backend
-from .baked_scene import IMAGES, BakedSceneLike, DrawCache, common_size, packed
+from .baked_renderer import BakedRenderer, Workspace
+from .baked_scene import IMAGES, BakedSceneLike, DrawCache, check_images, common_size, packed
 from .project import CameraLike
 
 __all__ = ["IMAGES", "BakedSceneLike", "DrawCache", "common_size", "draw", "packed"]
@@ -38,7 +39,14 @@ def draw(
             CPU, the atlas was not decoded from BC7 blocks; on a CUDA device, views times surfels exceed 2^24.
         RuntimeError: not enough memory on the device, or WebGPU is requested but not available.
     """
-    if scene.through_webgpu:
-        return webgpu.draw(scene, cameras, background, images, photo_pixel)
-    by = baked_cuda if cuda_backend(scene.tiles.device) else baked_cpu
-    return by.draw(scene, cameras, background, images, photo_pixel)
+    device, size = scene.tiles.device, common_size(cameras)
+    on_cuda = cuda_backend(device) and not scene.through_webgpu
+    check_images(images, on_cuda)
+    if not on_cuda:
+        by = webgpu if scene.through_webgpu else baked_cpu
+        return by.draw(scene, cameras, background, images, photo_pixel)
+    with scene.cache.workspaces(lambda: Workspace(device)).borrow() as workspace:
+        renderer = BakedRenderer(
+            scene, *size, len(cameras), images, background, photo_pixel=photo_pixel, workspace=workspace
+        )
+        return renderer.draw(cameras)  # waits: the next frame may use the memory on another stream

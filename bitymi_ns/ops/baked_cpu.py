@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from .backend import kernel, lookup
-from .baked_scene import BakedSceneLike, check_images, common_size, residual, tile_levels
+from .baked_scene import BakedSceneLike, residual, tile_levels
 from .constants import BAKED_CHANNELS, MAP_CHANNELS
 from .project import CameraLike, geometry_of, project
 from .trace_cpu import tile_lists
@@ -93,8 +93,6 @@ def draw(
     photo_pixel: float = 1.0,
 ) -> dict[str, Tensor]:
     """Draw views one by one; see `baked.draw`."""
-    check_images(images, on_cuda=False)
-    common_size(cameras)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:
         maps = any(name not in ("rgb", "alpha") for name in images)

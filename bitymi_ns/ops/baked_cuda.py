@@ -1,31 +1,20 @@
-"""Rendering of baked scenes with the CUDA kernels: textures, working memory, kernel calls."""
+"""Baked scenes in the form that the CUDA kernels read: textures of the atlas, arrays of the surfels."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from enum import IntFlag
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .backend import function, lookup, module, on_device
-from .baked_scene import IMAGES, LEVELS, BakedSceneLike, check_images, common_size, decode_bc7, residual
-from .constants import TILE
+from .backend import function, lookup, on_device
+from .baked_scene import LEVELS, BakedSceneLike, decode_bc7, residual
 from .parameters import GEOMETRY
-from .project import CameraLike, geometry_of
+from .project import geometry_of
 from .view_color import REDUCED, check_reduced, check_view_color, lettered
 from .view_kinds import VIEW_COLORS
-
-
-class Stage(IntFlag):
-    """Stages of a frame, for timing; each needs the results of the previous ones in the working memory."""
-
-    LIST = 1
-    DRAW = 2
-    ALL = 3
 
 
 def draws_blocks(device: torch.device) -> bool:
@@ -141,7 +130,7 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
 
     Args:
         scene: on a CUDA device.
-        photo_pixel: as in `frame`; below 1 the levels of the tiles are added.
+        photo_pixel: as in `baked.draw`; below 1 the levels of the tiles are added.
 
     Raises:
         TypeError: the surfels are not float32.
@@ -180,151 +169,3 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
             tiles=scene.tiles.contiguous(),
             near=scene.near,
         )
-
-
-def tiles_of(views: int, width: int, height: int) -> int:
-    """Count the screen tiles of all views."""
-    return -(-width // TILE) * -(-height // TILE) * views
-
-
-def slots_per_tile(capacity: int, tiles: int) -> int:
-    """Choose the slots for the pairs of each screen tile: twice the mean of `capacity` pairs, more if all fit in 32 MB,
-    at most what a block of threads sorts at once. Further pairs share one list of all tiles."""
-    return max(32, min(1024, max(2 * capacity, 1 << 23) // tiles) // 32 * 32)
-
-
-class Workspace:
-    """Working memory of frames on a device; it grows as needed and is kept.
-
-    Attributes:
-        capacity: pairs of surfel and screen tile that fit, for any distribution over the tiles.
-        slots: per tile; 0 before the first frame.
-        memory: [bytes] uint8; None before the first frame.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self._device = device
-        self.capacity = self.slots = 0
-        self.memory: Tensor | None = None
-
-    def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
-        """Allocate for such frames with at least `capacity` pairs, or the number that `frame_fitted` found. Raises
-        ValueError: more surfels, views or pairs than a frame can have; states the numbers."""
-        kernels, device = module(self._device), self._device
-        most = kernels.MOST_PAIRS
-        if capacity > most:
-            raise ValueError(f"the view needs {capacity} pairs of surfel and tile, a frame can have {most}")
-        self.capacity = max(self.capacity, capacity) or min(most, 4 * surfels * views)
-        self.slots = slots_per_tile(self.capacity, tiles_of(views, width, height))
-        size = {"surfels": surfels, "views": views, "width": width, "height": height, "normals": normals}
-        with on_device(device):
-            needed = kernels.baked_memory(**size, slots=self.slots, capacity=self.capacity)
-        if self.memory is None or self.memory.numel() < needed:
-            self.memory = None  # frees the old memory first
-            self.memory = torch.empty(needed, dtype=torch.uint8, device=device)
-
-    def counts(self) -> tuple[int, int]:
-        """Return the pairs of the latest non-empty frame, and those without a slot; waits for the device."""
-        assert self.memory is not None
-        pairs, spilled = self.memory[:16].view(torch.int64).tolist()
-        return pairs, spilled
-
-    @property
-    def pairs(self) -> int:
-        """Return the pairs of surfel and tile in the latest non-empty frame; waits for the device."""
-        return self.counts()[0]
-
-    @property
-    def complete(self) -> bool:
-        """True if all pairs of the latest non-empty frame fitted; waits for the device."""
-        return self.counts()[1] <= self.capacity
-
-    def frame_fitted(self) -> bool:
-        """Return True if the latest frame fitted; waits for the device. The next `resize` allocates for its pairs
-        and a quarter more."""
-        pairs, spilled = self.counts()
-        fitted = spilled <= self.capacity
-        self.capacity = pairs + pairs // 4 + 1
-        return fitted
-
-
-def empty_images(names: Sequence[str], views: int, width: int, height: int, device: torch.device) -> dict[str, Tensor]:
-    """Allocate images: name -> [views, height, width, channels] (IMAGES)."""
-    check_images(names, on_cuda=True)
-    shape = (views, height, width)
-    return {name: torch.empty(*shape, IMAGES[name][0], dtype=IMAGES[name][1], device=device) for name in names}
-
-
-def stack_cameras(cameras: Sequence[CameraLike], device: torch.device) -> tuple[Tensor, Tensor, int, int]:
-    """Stack cameras of one size: viewmats [V, 4, 4] and Ks [V, 3, 3], float32 on `device`, width and height. Raises
-    ValueError: no cameras, different sizes, or skew."""
-    size = common_size(cameras)
-    viewmats = torch.stack([camera.viewmat for camera in cameras]).to(device, torch.float32)
-    Ks = torch.stack([camera.K for camera in cameras]).to(device, torch.float32)
-    return viewmats, Ks, *size
-
-
-def frame(
-    scene: Any,  # from `compiled`
-    viewmats: Tensor,
-    Ks: Tensor,
-    background: Tensor | None,
-    images: Mapping[str, Tensor],
-    workspace: Workspace,
-    stages: Stage = Stage.ALL,
-    photo_pixel: float = 1.0,
-) -> None:
-    """Draw views into `images` without allocating or waiting, so that it can be recorded in a CUDA graph.
-
-    If the workspace is too small for the pairs, surfels are missing: check `workspace.complete`, `resize` and draw
-    again.
-
-    Args:
-        viewmats: [V, 4, 4] float32, world to camera, on the scene's device.
-        Ks: [V, 3, 3] float32, likewise.
-        background: [3] float32, likewise; None: black.
-        images: images to draw, from `empty_images`.
-        workspace: resized for such a frame.
-        photo_pixel: side of a photograph's pixel in pixels of the views.
-
-    Raises:
-        ValueError: wrong shape, or the workspace is too small.
-    """
-    _, height, width, _ = next(iter(images.values())).shape
-    function("baked_frame", viewmats.device)(
-        **images,
-        scene=scene,
-        viewmats=viewmats,
-        Ks=Ks,
-        width=width,
-        height=height,
-        background=background,
-        stages=int(stages),
-        photo_pixel=photo_pixel,
-        memory=workspace.memory,
-        slots=workspace.slots,
-        capacity=workspace.capacity,
-    )
-
-
-def draw(
-    scene: BakedSceneLike,
-    cameras: Sequence[CameraLike],
-    background: Tensor | None,
-    images: Sequence[str],
-    photo_pixel: float = 1.0,
-) -> dict[str, Tensor]:
-    """Draw views in one batch; see `baked.draw`. Waits for the images, to check that the working memory sufficed."""
-    device, n = scene.tiles.device, len(scene.tiles)
-    viewmats, Ks, width, height = stack_cameras(cameras, device)
-    arrays = compiled(scene, photo_pixel)
-    if background is not None:
-        background = background.to(device, torch.float32).contiguous()
-    to = empty_images(images, len(cameras), width, height, device)
-    size = (n, len(cameras), width, height, "normal" in to)
-    with scene.cache.workspaces(lambda: Workspace(device)).borrow() as workspace:
-        while True:  # a second time if the pairs did not fit
-            workspace.resize(*size)
-            frame(arrays, viewmats, Ks, background, to, workspace, photo_pixel=photo_pixel)
-            if n == 0 or workspace.frame_fitted():  # waits: the next frame may use the memory on another stream
-                return to

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.baked_cuda import Workspace, tiles_of
+from bitymi_ns.ops.baked_renderer import Workspace, tiles_of
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.sampling import averaged

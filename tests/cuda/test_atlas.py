@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from bitymi_ns.ops import baked_cuda
+from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cuda import Sheet
 from bitymi_ns.ops.baked_scene import DrawCache, tile_levels
 from tests.cuda.baked_scenes import front, textured
@@ -31,7 +32,7 @@ def test_where_pages_lie_in_the_texture_does_not_show(
         assert made.down == 3 and made.width % 4 == 0 and made.height % 4 == 0
         monkeypatch.setattr(Sheet, "of", lambda *size, made=made, down=down: made._replace(down=down))
         placed = replace(scene, atlas=pages, tiles=tiles).to(device)
-        images.append(baked_cuda.draw(placed, [front()], None, ("rgb",), photo_pixel)["rgb"])
+        images.append(draw(placed, [front()], None, ("rgb",), photo_pixel)["rgb"])
         monkeypatch.undo()
     for image in images[1:]:
         off = (image - images[0]).abs()  # where a coordinate lies between two of the texture unit's fractions

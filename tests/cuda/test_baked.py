@@ -17,14 +17,15 @@ from bitymi_ns.bake import bake_field, export
 from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.bake_options import BakeOptions
-from bitymi_ns.ops import baked_cuda
+from bitymi_ns.ops import baked_cuda, baked_renderer
 from bitymi_ns.ops.backend import module
 from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cuda import Sheet, draws_blocks
+from bitymi_ns.ops.baked_renderer import BakedRenderer
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from bitymi_ns.scene import Camera, baked_renderer
+from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import FAST, BakedScene
-from bitymi_ns.scene.baked_renderer import BakedRenderer, SceneRenderer
+from bitymi_ns.scene.scene_renderer import SceneRenderer
 from tests.bake.conftest import make_surfels
 from tests.bake.test_real_scene import real_scene
 from tests.bundle.compact_scene import make_codes, write_compact
@@ -372,6 +373,7 @@ def test_frames_are_begun_on_the_device_of_the_scene(device: torch.device, monke
         entered.append(of)
         yield
 
+    renderer = BakedRenderer(textured(4, 0).to(device), 8, 9)
     monkeypatch.setattr(baked_renderer, "on_device", on_device)
-    BakedRenderer(textured(4, 0).to(device), 8, 9).draw([front(8, 9)])
+    renderer.draw([front(8, 9)])
     assert [of.type for of in entered] == [device.type]

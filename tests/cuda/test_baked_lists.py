@@ -4,11 +4,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops import baked_cuda
-from bitymi_ns.ops.baked_cuda import Stage, Workspace, slots_per_tile
+from bitymi_ns.ops import baked_renderer
+from bitymi_ns.ops.baked_renderer import BakedRenderer, Stage, Workspace, slots_per_tile
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.scene.baked_renderer import BakedRenderer
 from tests.bake.conftest import make_surfels
 from tests.cuda.baked_scenes import FLIP, camera_of, front, listed_pairs, most, scene_of
 from tests.ops.golden import SceneCase, crossing_scene, random_scene, reference, tiles_reached
@@ -83,7 +82,7 @@ def test_discs_across_the_camera_plane_are_listed_where_they_show(
 @pytest.fixture
 def few_slots(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give tiles the fewest slots that the kernels support."""
-    monkeypatch.setattr(baked_cuda, "slots_per_tile", lambda capacity, tiles: 32)
+    monkeypatch.setattr(baked_renderer, "slots_per_tile", lambda capacity, tiles: 32)
 
 
 def test_a_frame_that_does_not_fit_is_drawn_again(device: torch.device, cpu, few_slots: None) -> None:
@@ -151,7 +150,7 @@ def test_pairs_without_a_slot_are_listed_like_the_others(
     cameras = [front(width, height, distance) for distance in (4.0, 6.0, 5.0)[:views]]
     found = []
     for slots in (1024 * -(-count // 1024), 32):
-        monkeypatch.setattr(baked_cuda, "slots_per_tile", lambda capacity, tiles, slots=slots: slots)
+        monkeypatch.setattr(baked_renderer, "slots_per_tile", lambda capacity, tiles, slots=slots: slots)
         renderer = BakedRenderer(scene, width, height, views, images=("rgb", "overdraw"))
         images = {name: image.clone() for name, image in renderer.draw(cameras).items()}
         found.append((images, lists_of(renderer, count, width, height, views), renderer.workspace.counts()))

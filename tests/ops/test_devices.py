@@ -8,6 +8,7 @@ from bitymi_ns.ops.backend import emulated_cuda, kernel, module
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
+from tests.cuda.baked_scenes import front
 from tests.cuda.conftest import why_not_emulated
 from tests.ops.golden import camera_of, random_scene, traced
 
@@ -33,9 +34,9 @@ def test_the_tracers_refuse_each_others_tensors() -> None:
 def test_an_image_that_the_cpu_does_not_draw_is_named() -> None:
     scene = BakedScene({}, "sv", torch.zeros(0, 5, dtype=torch.int32))
     with pytest.raises(ValueError, match="'packed' is drawn on a CUDA device only: draw rgb and alpha"):
-        baked.draw(scene, [], None, ("packed",))
+        baked.draw(scene, [front()], None, ("packed",))
     with pytest.raises(ValueError, match="no image 'colour'"):
-        baked.draw(scene, [], None, ("colour",))
+        baked.draw(scene, [front()], None, ("colour",))
     with pytest.raises(ValueError, match="one size"):
         baked.draw(scene, [], None, ("rgb",))
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ..baked_cuda import decoded
-from ..baked_scene import BakedSceneLike, check_images, common_size
+from ..baked_scene import BakedSceneLike
 from ..project import CameraLike
 from .arrays import FRAME, SEEN, arrays
 from .device import check_room, device, in_software, library
@@ -334,8 +334,6 @@ def draw(
 ) -> dict[str, Tensor]:
     """Draw views one by one to the CPU; see `baked.draw`. Raises WebGpuUnavailable: the package wgpu or a graphics
     device is missing."""
-    check_images(images, on_cuda=False)
-    common_size(cameras)
     texels = (scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual, scene.mean_alpha)
     sources = (*scene.surfels.values(), *texels)
     scales = f"{scene.offset} {scene.scale} {scene.alpha_scale}"

@@ -21,9 +21,9 @@ from bitymi_ns.plugin.console import fail
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.data.views import DATA
 from bitymi_ns.scene.baked import FAST
-from bitymi_ns.scene.baked_renderer import SceneRenderer
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.crop import Box
+from bitymi_ns.scene.scene_renderer import SceneRenderer
 from .device import kernel_device
 from .surfel_model import SurfelModel, SurfelModelConfig, box_of
 

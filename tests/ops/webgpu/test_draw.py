@@ -17,6 +17,7 @@ from torch import Tensor
 
 from bitymi_ns.codec.bc7_encode import bc7_encoder
 from bitymi_ns.ops import webgpu
+from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cpu import draw as draw_on_cpu
 from bitymi_ns.ops.baked_scene import decode_bc7
 from bitymi_ns.ops.parameters import GEOMETRY
@@ -269,7 +270,7 @@ def test_what_was_changed_is_drawn_anew() -> None:
 def test_what_cannot_be_drawn_is_refused() -> None:
     scene = replace(textured(5, 0), through_webgpu=True)
     with pytest.raises(ValueError, match="packed"):
-        webgpu.draw(scene, [front()], None, ["packed"])
+        draw(scene, [front()], None, ["packed"])
     scene.tiles = scene.tiles.clone()
     scene.tiles[1, 0] = 10_000
     with pytest.raises(ValueError, match="surfel 1"):

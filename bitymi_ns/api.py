@@ -149,8 +149,8 @@ def rasterize(
     surfels |= {"opacity_logits": _logit(opacities), "beta_raw": _logit(betas / BETA_MAX)}
     projection = project(*geometry_of(surfels), camera=camera, near=near)
     base = colors - COLOR_BIAS
-    if not maps and can_rasterize(means.device):
-        image, fragments = rasterize_image(projection, base)
+    if can_rasterize(means.device):
+        image, fragments = rasterize_image(projection, base, maps=maps)
         return RenderOutput.of_image(image, projection, fragments, background, maps)
 
     def draw(part: Projection, most: int | None) -> tuple[Tensor, Fragments]:

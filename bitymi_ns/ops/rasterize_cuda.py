@@ -11,7 +11,7 @@ from .backend import cuda_backend, dense, kernel, module
 from .bands import Unlisted
 from .bin_cuda import tile_lists
 from .blend import checked_texels
-from .constants import IMAGE_CHANNELS
+from .constants import IMAGE_CHANNELS, MAP_CHANNELS
 from .project import Projection
 from .texel import TexelDescent, TexelTiles, gradient_or_step
 from .trace_cuda import layout_of
@@ -25,14 +25,15 @@ def can_rasterize(device: torch.device) -> bool:
 
 class _Rasterized(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, geom, base, texels, texel_alpha, projection, tiles, bound, rim, moves, descent):
+    def forward(ctx, geom, base, texels, texel_alpha, projection, tiles, bound, rim, maps, moves, descent):
         g, b, t = dense(geom, geom), dense(base, geom), dense(texels, geom)
         camera, bins = projection.camera, tile_lists(g, projection)
         pairs, pixels = len(bins.surfel), camera.width * camera.height
         masks = torch.empty(module(g.device).TILE_WARPS, pairs, dtype=torch.int32, device=g.device)
         cuts = torch.empty_like(masks) if projection.alpha is not None else None
-        image, transmittance = g.new_empty(pixels, IMAGE_CHANNELS), g.new_empty(pixels)
-        ctx.arguments = {**projection.view(g), **projection.alpha_arrays, **tiles.arrays, "bound": bound}
+        image = g.new_empty(pixels, MAP_CHANNELS if maps else IMAGE_CHANNELS)
+        transmittance = g.new_empty(pixels)
+        ctx.arguments = {**projection.view(g), **projection.alpha_arrays, **tiles.arrays, "bound": bound, "maps": maps}
         kernel("rasterize_forward", g)(
             **ctx.arguments,
             base=b,
@@ -59,7 +60,8 @@ class _Rasterized(torch.autograd.Function):
             "dbase": torch.empty_like(base),
         }
         dtexels, step = gradient_or_step(texels, ctx.needs_input_grad[2], ctx.descent)
-        work = {"partial": geom.new_empty(pairs, kernels.TRACE_SUMS), "color_partial": geom.new_empty(pairs, 4)}
+        work = {"partial": geom.new_empty(pairs, kernels.TRACE_SUMS)}
+        work["color_partial"] = geom.new_empty(pairs, 8 if ctx.arguments["maps"] else 4)
         dalpha = torch.empty_like(texel_alpha) if ctx.needs_input_grad[3] else None
         if "moved" in step or dalpha is not None:
             work["texel_work"] = geom.new_empty(4 * len(texels))
@@ -79,7 +81,7 @@ class _Rasterized(torch.autograd.Function):
             dtexel_alpha=dalpha,
         )
         ctx.projection.take_mean2d(out["dgeom"][:, :2], out["absgrad"])
-        return out["dgeom"], out["dbase"], dtexels, dalpha, None, None, None, None, None, None
+        return out["dgeom"], out["dbase"], dtexels, dalpha, *(None,) * 7
 
 
 def rasterize_image(
@@ -88,22 +90,23 @@ def rasterize_image(
     texels: Tensor | None = None,
     tiles: TexelTiles | None = None,
     bound: float = 0.0,
+    maps: bool = False,
     move_surfels: bool = True,
     descent: TexelDescent | None = None,
     rim: float = 1e-3,
 ) -> tuple[Tensor, Unlisted]:
-    """Draw a view: `trace` and `blended_image` without maps, in one kernel each forward and backward.
+    """Draw a view: `trace` and `blended_image` in one kernel each forward and backward.
 
     Differentiable in `projection.geom`, its alpha texels, `base` and `texels`. The backward pass fills
     `projection.mean2d_grad` and `projection.mean2d_absgrad`. Only sums over texels depend on the thread order.
 
     Args:
         projection: from `project`, on a device where `can_rasterize`; geom [N, 16].
-        base, texels, tiles, bound, move_surfels, descent: as in `blended_image`.
+        base, texels, tiles, bound, maps, move_surfels, descent: as in `blended_image`.
         rim: as in `trace`.
 
     Returns:
-        [H * W, 5] rgb, alpha, sum w beta, as from `blended_image`; and the view's fragments.
+        [H * W, 5 or, with maps, 9] as from `blended_image`; and the view's fragments.
 
     Raises:
         RuntimeError: 2^31 pairs of surfel and tile or more, or not a CUDA device.
@@ -117,5 +120,6 @@ def rasterize_image(
     if descent is not None and not base.requires_grad:
         base = base.detach().requires_grad_()  # so that there is a backward pass, even if nothing else learns
     alpha = None if projection.alpha is None else projection.alpha.values
-    image, layout = _Rasterized.apply(geom, base, texels, alpha, projection, tiles, bound, rim, move_surfels, descent)
+    how = (projection, tiles, bound, rim, maps, move_surfels, descent)
+    image, layout = _Rasterized.apply(geom, base, texels, alpha, *how)
     return image, Unlisted(projection.detached(), rim, layout=layout)

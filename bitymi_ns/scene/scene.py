@@ -169,8 +169,8 @@ class Scene(nn.Module):
     ) -> RenderOutput:
         """Render a view: visibility, then shading, then compositing.
 
-        On a GPU scenes without a hash field are rasterized without fragment lists, unless maps or soft overdraw are
-        requested. A view with more fragments than `config.max_fragments`, or than memory holds, is rendered in bands.
+        On a GPU scenes without a hash field are rasterized without fragment lists, unless soft overdraw is requested. A
+        view with more fragments than `config.max_fragments`, or than memory holds, is rendered in bands.
 
         Args:
             background: [3] colour behind the scene; None: black.
@@ -188,10 +188,10 @@ class Scene(nn.Module):
         learns, bound = field_mode == "train", self.config.weight_bound
         descent = descent if learns else None
         projection = project(*geometry_of(p), camera=camera, near=self.near, alpha=self.opacity(learns))
-        texture = None if maps or overdraw_half is not None else self._unlisted_texture(learns, descent)
+        texture = None if overdraw_half is not None else self._unlisted_texture(learns, descent)
         base = self.base_color(projection)
         if texture is not None:
-            image, fragments = rasterize_image(projection, base, **texture, rim=self.config.rim)
+            image, fragments = rasterize_image(projection, base, **texture, maps=maps, rim=self.config.rim)
             return RenderOutput.of_image(image, projection, fragments, background, maps)
         read: Tensor | None = None
 

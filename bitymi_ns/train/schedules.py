@@ -130,12 +130,6 @@ class Schedule:
         loss = self.config.loss
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
 
-    def lists_fragments(self, maps: bool) -> bool:
-        """Return True if some steps need fragment lists even on a GPU: for the overdraw, depth or normal loss. `maps`:
-        some views have depth or normals."""
-        loss = self.config.loss
-        return loss.overdraw_weight > 0.0 or maps and max(loss.depth_weight, loss.normal_weight) > 0.0
-
     def densification_over(self, step: int) -> bool:
         """Return True if no densification follows this step, so that its statistics are not needed."""
         return not self.densify_steps or step > max(self.densify_steps)

@@ -78,11 +78,17 @@ BT_HD void add_blended(S weight, const S* color, const S& beta, const S& depth, 
     sums[6] += weight * normal[0], sums[7] += weight * normal[1], sums[8] += weight * normal[2];
   }
 }
-// Computes dL/dweight from the gradient of the sums.
+// Compute dL/dweight from the gradient of the sums: the parts of the image and of the maps, and their sum.
+template <class S> BT_HD S image_gradient(const S* d, const S* color, const S& beta) {
+  return d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] + d[4] * beta;
+}
+template <class S> BT_HD S map_gradient(const S* d, const S& depth, const S* normal) {
+  return d[5] * depth + d[6] * normal[0] + d[7] * normal[1] + d[8] * normal[2];
+}
 template <bool kMaps, class S>
 BT_HD S weight_gradient(const S* d, const S* color, const S& beta, const S& depth, const S* normal) {
-  S gradient = d[0] * color[0] + d[1] * color[1] + d[2] * color[2] + d[3] + d[4] * beta;
-  if constexpr (kMaps) gradient += d[5] * depth + d[6] * normal[0] + d[7] * normal[1] + d[8] * normal[2];
+  S gradient = image_gradient(d, color, beta);
+  if constexpr (kMaps) gradient += map_gradient(d, depth, normal);
   return gradient;
 }
 

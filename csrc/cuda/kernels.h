@@ -137,21 +137,22 @@ struct SelectPairs {
 };
 void select_fragments(const SelectPairs& a, Stream stream);
 
-// Draws a view without a fragment list: `trace` and `blend` in one, opaque or with alpha texels, without maps. Writes
-// image [height, width, kImageChannels] as BlendForward, and for the backward pass masks, cuts and each pixel's
-// transmittance [height, width].
+// Draws a view without a fragment list: `trace` and `blend` in one, opaque or with alpha texels. Writes image
+// [height, width, kImageChannels or, with maps, kMapChannels] as BlendForward, and for the backward pass masks, cuts
+// and each pixel's transmittance [height, width].
 template <class S> struct RasterizeForward : MarkedView<S> {
   TexelTiles<S> table;
   S bound;
+  int maps;
   S *image, *transmittance;
 
   template <class R> void fields(R& r) {
     MarkedView<S>::fields(r);
     table.fields(r);
     check_tiles(r, table, this->alpha, this->view.n);
-    r.number("bound", bound);
+    r.numbers("bound", bound, "maps", maps);
     const int64_t pixels = int64_t(this->view.width) * this->view.height;
-    r.array("image", image, pixels * kImageChannels);
+    r.array("image", image, pixels * (maps ? kMapChannels : kImageChannels));
     r.array("transmittance", transmittance, pixels);
   }
 };
@@ -186,7 +187,7 @@ template <class S> struct RasterizeBackward {
   Pairs layout;
   const uint32_t* cuts;
   const S *transmittance, *dimage;
-  int moves;
+  int moves, maps;
   S *partial, *color_partial, *dgeom, *absgrad, *dbase;
   TexelStep<S> step;
 
@@ -195,16 +196,16 @@ template <class S> struct RasterizeBackward {
     alpha.fields(r, view.n);
     table.fields(r);
     check_tiles(r, table, alpha, view.n);
-    r.numbers("rim", rim, "bound", bound, "moves", moves);
+    r.numbers("rim", rim, "bound", bound, "moves", moves, "maps", maps);
     take(r, "layout", layout);
     if (!layout.fits(view.n, view.width, view.height)) r.refuse("the layout belongs to another view");
     r.maybe("cuts", cuts, kTileWarps * layout.pairs);
     if (alpha.values && !cuts) r.refuse("alpha texels need cuts");
     const int64_t pixels = int64_t(view.width) * view.height;
     r.array("transmittance", transmittance, pixels);
-    r.array("dimage", dimage, pixels * kImageChannels);
+    r.array("dimage", dimage, pixels * (maps ? kMapChannels : kImageChannels));
     r.work("partial", partial, layout.pairs * kTraceSums);
-    r.work("color_partial", color_partial, layout.pairs * 4);
+    r.work("color_partial", color_partial, layout.pairs * (maps ? 8 : 4));
     r.array("dgeom", dgeom, view.n * kGeom);
     r.array("absgrad", absgrad, view.n * 2);
     r.array("dbase", dbase, view.n * 3);

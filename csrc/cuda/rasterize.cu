@@ -17,21 +17,24 @@ namespace bt::cuda {
 
 namespace {
 
-template <class S, bool kAlpha>
+constexpr int channels_of(bool maps) { return maps ? kMapChannels : kImageChannels; }
+
+template <class S, bool kAlpha, bool kMaps>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_kernel(RasterizeForward<S> a) {
   using T = FastFloatOr<S>;
+  constexpr int kChannels = channels_of(kMaps);
   const TileThread s = tile_thread(a.view.width);
-  S sum[kImageChannels];
-  for (int c = 0; c < kImageChannels; ++c) sum[c] = S(0);
+  S sum[kChannels];
+  for (int c = 0; c < kChannels; ++c) sum[c] = S(0);
   const S behind = mark_pairs<kAlpha>(a, s, [&](int64_t id, const S* g, const Fragment<T>& f, S weight) {
     const TexelPatch<S> patch(a.table, id);
     const Vec3<S> c = patch.color(weight, a.bound, plain(f.u), plain(f.v));
     const S color[3] = {c.x, c.y, c.z};
-    add_blended<false>(weight, color, g[kBeta], S(0), static_cast<const S*>(nullptr), sum);
+    add_blended<kMaps>(weight, color, g[kBeta], plain(f.depth), a.view.geom + id * kGeom + kNx, sum);
   });
   if (s.x >= a.view.width || s.y >= a.view.height) return;
   const int64_t pixel = int64_t(s.y) * a.view.width + s.x;
-  for (int c = 0; c < kImageChannels; ++c) a.image[pixel * kImageChannels + c] = sum[c];
+  for (int c = 0; c < kChannels; ++c) a.image[pixel * kChannels + c] = sum[c];
   a.transmittance[pixel] = behind;
 }
 
@@ -79,12 +82,14 @@ template <int kHeld> struct LastPairs {
 enum FragmentBits { kPixel = kTileThreads - 1, kOpenRed = kTileThreads, kCut = 8 * kOpenRed, kTextured = 2 * kCut };
 
 // The fragments of LastPairs, and their turns, each of up to kRunLanes fragments of one pair.
-template <class S> struct Held : SurfelRows<S> {
-  static constexpr int kFragments = sizeof(S) == 8 ? 320 : 1024, kTurns = kFragments / kRunLanes + kWarp;
-  static constexpr int kColors = 4;  // sums of a pair for the view colour, the last unused
-  S gradient[kTileThreads * kImageChannels];
+template <class S, bool kMaps> struct Held : SurfelRows<S> {
+  static constexpr int kFragments = sizeof(S) == 8 ? (kMaps ? 256 : 320) : (kMaps ? 768 : 1024);
+  static constexpr int kTurns = kFragments / kRunLanes + kWarp, kChannels = channels_of(kMaps);
+  static constexpr int kColors = kMaps ? 8 : 4;  // sums of a pair: view colour and, from kNormal on, normal
+  static constexpr int kNormal = 4;
+  S gradient[kTileThreads * kChannels];
   S weight[kFragments], u[kFragments], v[kFragments], sigma[kFragments];  // sigma as listed
-  S dsigma[kFragments], du[kFragments], dv[kFragments];                   // dsigma holds dL/dweight first
+  S dsigma[kFragments], du[kFragments], dv[kFragments];  // dsigma holds dL/dweight first, before that the maps' part
   S sums[kTurns * kTraceSums], color_sums[kTurns * kColors];
   int32_t bits[kFragments], begin[kWarp], count[kWarp], first_turn[kWarp];
   uint8_t pair[kTurns];
@@ -123,17 +128,20 @@ template <class S> struct Held : SurfelRows<S> {
   }
 };
 
-template <class S, bool kAlpha, bool kTexels>
-__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward_kernel(RasterizeBackward<S> a) {
+template <class S, bool kAlpha, bool kTexels, bool kMaps>
+__global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
+                                                : kMaps        ? 2
+                                                               : 3) backward_kernel(RasterizeBackward<S> a) {
   using T = FastFloatOr<S>;
-  constexpr int kColors = Held<S>::kColors;
-  __shared__ Held<S> held;
+  using Chunk = Held<S, kMaps>;
+  constexpr int kColors = Chunk::kColors, kChannels = Chunk::kChannels;
+  __shared__ Chunk held;
   const Pairs& p = a.layout;
   const TileThread s = tile_thread(p.width);
   const auto [first, last] = block_pairs(p);
   if (first == last) return;
   const int64_t listed = p.tile_pairs[blockIdx.x + 1];
-  TilePart(p).load<kImageChannels>(a.dimage, held.gradient);
+  TilePart(p).load<kChannels>(a.dimage, held.gradient);
   const int tile_left = s.left - s.left % kTile, tile_top = s.top - s.top % kTile;
   const int lane = int(threadIdx.x) % kRunLanes;
   S transmittance = S(1);
@@ -141,7 +149,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
   T later = T(S(0));  // sum of w dL/dw
   int64_t end = last;
   while (end > first) {
-    const LastPairs<Held<S>::kFragments> part(p, kAlpha ? a.cuts : nullptr, s, first, listed, end);
+    const LastPairs<Chunk::kFragments> part(p, kAlpha ? a.cuts : nullptr, s, first, listed, end);
     const int64_t lanes = end - kWarp;  // pair of lane 0
     end -= kWarp - part.first_lane;
     if (s.warp == 0) held.make_turns(part, s.lane);
@@ -165,7 +173,10 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       held.weight[i] = sigma * transmittance;
       held.u[i] = plain(f.u), held.v[i] = plain(f.v);
       held.sigma[i] = plain(f.low_pass) > S(0) ? -sigma : sigma;
-      held.bits[i] = (s.y - tile_top) * kTile + s.x - tile_left + (is_cut ? kCut : 0);
+      const int pixel = (s.y - tile_top) * kTile + s.x - tile_left;
+      held.bits[i] = pixel + (is_cut ? kCut : 0);
+      if constexpr (kMaps)
+        held.dsigma[i] = map_gradient(held.gradient + pixel * kChannels, plain(f.depth), held.rows[j].g + kNx);
     });
     __syncthreads();
     held.each_turn([&](int, int j, int i, bool mine) {
@@ -173,7 +184,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       const TexelPatch<S> patch(a.table, held.ids[j]);
       const S w = held.weight[i];
       int bits = held.bits[i];
-      const S* d = held.gradient + (bits & kPixel) * kImageChannels;
+      const S* d = held.gradient + (bits & kPixel) * kChannels;
       Vec3<S> color = patch.view;
       if (kTexels && w >= a.bound && patch.textured()) {
         bits |= kTextured;
@@ -189,7 +200,8 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       BT_UNROLL
       for (int c = 0; c < 3; ++c)
         if (rgb[c] > S(0)) bits |= kOpenRed << c;
-      held.dsigma[i] = weight_gradient<false>(d, rgb, held.rows[j].g[kBeta], S(0), static_cast<const S*>(nullptr));
+      const S dweight = image_gradient(d, rgb, held.rows[j].g[kBeta]);
+      held.dsigma[i] = kMaps ? held.dsigma[i] + dweight : dweight;
       held.bits[i] = bits;
     });
     __syncthreads();
@@ -205,13 +217,18 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       BT_UNROLL
       for (int c = 0; c < kTraceSums; ++c) sums[c] = T(S(0));
       int bits = 0;
-      S sigma = S(0), gs = S(0), gu = S(0), gv = S(0), dcolor[kColors] = {S(0), S(0), S(0), S(0)};
+      S sigma = S(0), gs = S(0), gu = S(0), gv = S(0), gz = S(0), dcolor[kColors] = {};
       if (mine) {
         bits = held.bits[i], sigma = held.sigma[i], gs = held.dsigma[i];
-        const S w = held.weight[i], *d = held.gradient + (bits & kPixel) * kImageChannels;
+        const S w = held.weight[i], *d = held.gradient + (bits & kPixel) * kChannels;
         BT_UNROLL
         for (int c = 0; c < 3; ++c) dcolor[c] = bits & (kOpenRed << c) ? w * d[c] : S(0);
         sums[kBeta] = T(w * d[4]);
+        if constexpr (kMaps) {
+          gz = w * d[5];
+          BT_UNROLL
+          for (int c = 0; c < 3; ++c) dcolor[Chunk::kNormal + c] = w * d[6 + c];
+        }
         if (a.moves && bits & kTextured) gu = held.du[i], gv = held.dv[i];
       }
       if constexpr (kTexels) {
@@ -232,8 +249,8 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
       if (mine) {
         const int pixel = bits & kPixel;
         fragment_vjp<S, T>(g, a.view.near, a.rim, T(pixel_centre<S>(tile_left + pixel % kTile) - g[kCx]),
-                           T(pixel_centre<S>(tile_top + pixel / kTile) - g[kCy]), T(sigma), T(gs), T(gu), T(gv),
-                           T(S(0)), sums, ddx, ddy);
+                           T(pixel_centre<S>(tile_top + pixel / kTile) - g[kCy]), T(sigma), T(gs), T(gu), T(gv), T(gz),
+                           sums, ddx, ddy);
       }
       sums[kShape] = abs_(ddx), sums[kShape + 1] = abs_(ddy);
       S plain_sums[kTraceSums];
@@ -251,11 +268,13 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 3) backward
   }
 }
 
-template <class S> struct StoreColorGradient {
+template <class S, bool kMaps> struct StoreColorGradient {
   const S* base;
-  S* dbase;
+  S *dbase, *dgeom;
   __device__ void operator()(int64_t surfel, int column, S sum) const {
-    if (column == 3) return;
+    constexpr int kNormal = Held<S, kMaps>::kNormal;
+    if (column >= kNormal && column < kNormal + 3) dgeom[surfel * kGeom + kNx + column - kNormal] = sum;
+    if (column >= 3) return;
     const int64_t at = 3 * surfel + column;
     dbase[at] = base_gradient(base[at], sum);
   }
@@ -273,25 +292,30 @@ template <class S> struct PutTexel {
 }  // namespace
 
 template <class S> void rasterize_forward(const RasterizeForward<S>& a, Stream stream) {
-  const auto run = a.alpha.values ? forward_kernel<S, true> : forward_kernel<S, false>;
+  const auto run = a.maps ? (a.alpha.values ? forward_kernel<S, true, true> : forward_kernel<S, false, true>)
+                          : (a.alpha.values ? forward_kernel<S, true, false> : forward_kernel<S, false, false>);
   BT_LAUNCH(run, dim3(unsigned(tiles_of(a.view.width, a.view.height))), dim3(kTileThreads), 0, stream, a);
 }
 
-template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream stream) {
+template <class S, bool kMaps> void backward(const RasterizeBackward<S>& a, Stream stream) {
   const Pairs& p = a.layout;
-  const TexelStep<S>& step = a.step;
-  if (step.sums) each_shown_texel(p, a.table, ClearTexel<S>{step.sums}, stream);
-  fill_zero(step.dalpha, step.dalpha ? a.alpha.texels : 0, stream);
-  const auto run = a.alpha.values   ? backward_kernel<S, true, true>
-                   : a.table.texels ? backward_kernel<S, false, true>
-                                    : backward_kernel<S, false, false>;
+  const auto run = a.alpha.values   ? backward_kernel<S, true, true, kMaps>
+                   : a.table.texels ? backward_kernel<S, false, true, kMaps>
+                                    : backward_kernel<S, false, false, kMaps>;
   if (p.pairs) BT_LAUNCH(run, dim3(unsigned(p.tiles())), dim3(kTileThreads), 0, stream, a);
   sum_slots<kTraceSums>(p, static_cast<const S*>(a.partial), StoreGeomGradient<S>{a.dgeom, a.absgrad}, stream);
-  sum_slots<Held<S>::kColors>(p, static_cast<const S*>(a.color_partial), StoreColorGradient<S>{a.table.base, a.dbase},
-                              stream);
+  sum_slots<Held<S, kMaps>::kColors>(p, static_cast<const S*>(a.color_partial),
+                                     StoreColorGradient<S, kMaps>{a.table.base, a.dbase, a.dgeom}, stream);
+}
+
+template <class S> void rasterize_backward(const RasterizeBackward<S>& a, Stream stream) {
+  const TexelStep<S>& step = a.step;
+  if (step.sums) each_shown_texel(a.layout, a.table, ClearTexel<S>{step.sums}, stream);
+  fill_zero(step.dalpha, step.dalpha ? a.alpha.texels : 0, stream);
+  a.maps ? backward<S, true>(a, stream) : backward<S, false>(a, stream);
   if (step.sums) {
     const MoveTexel<S, false> color = {step.sums, {}, step.share, step.rate, step.moved, nullptr};
-    each_shown_texel(p, a.table, PutTexel<S>{color, step.dalpha}, stream);
+    each_shown_texel(a.layout, a.table, PutTexel<S>{color, step.dalpha}, stream);
   }
 }
 

@@ -106,7 +106,7 @@ template <class S> void draw_view(const DrawView<S>& a, Stream stream) {
   const PairSpace<S> p = s.pairs(a);
   bin_fill(BinFill<S>{s.view(), s.of.order, s.of.slot_start, a.pairs, p.slot, p.surfel, p.tile_pairs, p.fill}, stream);
   const MarkedView<S> marked = {s.view(), s.v.alpha, a.pairs, p.surfel, p.tile_pairs, p.masks, p.cuts};
-  rasterize_forward(RasterizeForward<S>{marked, s.v.table, s.v.bound, s.of.image, s.of.transmittance}, stream);
+  rasterize_forward(RasterizeForward<S>{marked, s.v.table, s.v.bound, 0, s.of.image, s.of.transmittance}, stream);
   picture_loss(s.v.picture, s.v.photometric, s.v.falloff, stream);
 }
 
@@ -118,8 +118,9 @@ template <class S> void differentiate_view(const DifferentiateView<S>& a, Stream
   const Pairs layout = {v.width, v.height, v.surfels.n,  a.drawn.pairs, p.surfel,        p.slot,
                         p.masks, nullptr,  p.tile_pairs, s.of.order,    s.of.slot_start, -1};
   const RasterizeBackward<S> gradients = {
-      s.view(),    v.rim,   v.alpha,   v.table,         v.bound, layout,    p.cuts,     s.of.transmittance,
-      s.of.dimage, v.moves, p.partial, p.color_partial, a.dgeom, a.absgrad, s.of.dbase, a.step};
+      s.view(),           v.rim,       v.alpha, v.table, v.bound,   layout,          p.cuts,
+      s.of.transmittance, s.of.dimage, v.moves, 0,       p.partial, p.color_partial, a.dgeom,
+      a.absgrad,          s.of.dbase,  a.step};
   rasterize_backward(gradients, stream);
   view_color_backward(ViewColorBackward<S>{s.directions(), v.colors, s.of.dbase, a.dcolors, a.dmeans_color}, stream);
   project_backward(ProjectBackward<S>{v.surfels, v.viewmat, v.K, v.geom, a.dgeom, nullptr, a.out}, stream);

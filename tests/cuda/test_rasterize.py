@@ -69,11 +69,11 @@ class Learned:
             self.leaves["alphas"] = values.to(device, dtype).requires_grad_()
             self.alpha = ops.TexelAlpha(tiles, self.leaves["alphas"], BOUND)
 
-    def draw(self, listed: bool, moves: bool = True) -> dict[str, Tensor]:
+    def draw(self, listed: bool, moves: bool = True, maps: bool = False) -> dict[str, Tensor]:
         """Compute the picture, all gradients of a sum over it, and the texels afterwards."""
         projection = ops.project(*(self.leaves[name] for name in GEOMETRY), self.camera)
         projection.alpha = self.alpha
-        how = {**self.texture, "move_surfels": moves}
+        how = {**self.texture, "move_surfels": moves, "maps": maps}
         if listed:
             image = ops.blended_image(ops.trace(projection), projection, self.base, **how)
         else:
@@ -95,14 +95,15 @@ def compare(got: dict[str, Tensor], want: dict[str, Tensor], tolerance: float) -
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 @pytest.mark.parametrize("texture, moves", [("none", True), ("colors", True), ("colors", False), ("alphas", True)])
+@pytest.mark.parametrize("maps", [False, True], ids=["image", "maps"])
 def test_pictures_and_gradients_are_those_of_the_cpu(
-    texture: str, moves: bool, dtype: torch.dtype, device: torch.device, cpu
+    texture: str, moves: bool, maps: bool, dtype: torch.dtype, device: torch.device, cpu
 ) -> None:
     """Tiles with more fragments than shared memory holds and more than 32 surfels; the image ends within one."""
     case = random_scene(150, 3, width=70, height=40)
-    got = Learned(case, dtype, device, texture).draw(False, moves)
+    got = Learned(case, dtype, device, texture).draw(False, moves, maps)
     with cpu():
-        want = Learned(case, torch.float64, HERE, texture).draw(True, moves)
+        want = Learned(case, torch.float64, HERE, texture).draw(True, moves, maps)
     compare(got, want, 1e-9 if dtype == torch.float64 else 1e-3)
 
 
@@ -114,10 +115,15 @@ def test_the_golden_picture_and_gradients(device: torch.device) -> None:
 @pytest.mark.parametrize("moved", [False, True], ids=["gradients", "descent"])
 @pytest.mark.parametrize("scene", extreme_scenes(), ids=lambda case: case.name)
 def test_extreme_scenes(scene: SceneCase, moved: bool, device: torch.device, cpu) -> None:
+    """Maps are compared with lists on the same device: rounding decides which side of a disc seen edge-on is shown."""
     got = Learned(scene, torch.float64, device, extreme=True, moved=moved).draw(False)
     with cpu():
         want = Learned(scene, torch.float64, HERE, extreme=True, moved=moved).draw(True)
     compare(got, want, 1e-9)
+    drawn, listed = (
+        Learned(scene, torch.float64, device, extreme=True).draw(by_list, maps=True) for by_list in (False, True)
+    )
+    compare(drawn, listed, 1e-9)
 
 
 @pytest.mark.parametrize("texture", ["none", "alphas"])
@@ -135,9 +141,9 @@ def test_nothing_to_see_and_pictures_smaller_than_a_tile(
         case.params["means"] = case.params["means"][None]
     else:
         case.params["means"][7, 1] = float("nan")
-    got = Learned(case, torch.float64, device, texture).draw(False)
+    got = Learned(case, torch.float64, device, texture).draw(False, maps=True)
     with cpu():
-        want = Learned(case, torch.float64, HERE, texture).draw(True)
+        want = Learned(case, torch.float64, HERE, texture).draw(True, maps=True)
     compare(got, want, 1e-9)
     assert got["image"].any() == surfels.startswith("40")
 
@@ -147,14 +153,14 @@ def test_surfels_of_one_opacity(opacity: float, device: torch.device) -> None:
     """Tiles with opaque layers that hide others, or 1,000 nearly invisible ones."""
     case = random_scene(300, 8, width=20, height=20)
     case.params["opacity_logits"].fill_(opacity)
-    got, want = (Learned(case, torch.float64, device).draw(listed) for listed in (False, True))
+    got, want = (Learned(case, torch.float64, device).draw(listed, maps=True) for listed in (False, True))
     compare(got, want, 1e-9)
     assert got["image"].any() == (opacity > -20)
 
 
 def test_only_sums_of_texels_depend_on_the_order_of_threads(device: torch.device) -> None:
     case = random_scene(60, 3, width=70, height=40)
-    first, *others = in_orders(device, lambda: Learned(case, torch.float32, device).draw(False))
+    first, *others = in_orders(device, lambda: Learned(case, torch.float32, device).draw(False, maps=True))
     for other in others:
         for name in first.keys() - {"texels", "alphas"}:
             assert torch.equal(other[name], first[name]), name
@@ -192,8 +198,8 @@ def test_it_draws_on_cards_alone_and_not_where_sums_are_exact(device: torch.devi
 def test_which_pictures_of_a_scene_need_no_list(device: torch.device) -> None:
     scene, camera, _ = make(12, alpha=True, width=24, height=18)
     scene, camera = scene.to(device), camera.to(device)
-    unlisted = [scene.render(camera), scene.render(camera, field_mode="frozen")]
-    lists = [scene.render(camera, maps=True), scene.render(camera, overdraw_half=0.005)]
+    unlisted = [scene.render(camera), scene.render(camera, field_mode="frozen"), scene.render(camera, maps=True)]
+    lists = [scene.render(camera, overdraw_half=0.005)]
     assert all(isinstance(output.fragments, Unlisted) for output in unlisted)
     assert all(isinstance(output.fragments, ops.Fragments) for output in lists)
     for output in (*unlisted, *lists):
@@ -203,14 +209,25 @@ def test_which_pictures_of_a_scene_need_no_list(device: torch.device) -> None:
     assert isinstance(scene.render(camera).fragments, Unlisted)
 
 
-def test_the_public_function_lists_for_maps_alone(device: torch.device) -> None:
-    values, camera = {name: value.to(device) for name, value in surfels().items()}, api_camera().to(device)
-    drawn, listed = (bitymi_ns.rasterize(**values, camera=camera, maps=maps) for maps in (False, True))
-    assert isinstance(drawn.fragments, Unlisted) and isinstance(listed.fragments, ops.Fragments)
-    torch.testing.assert_close(drawn.rgb, listed.rgb, rtol=1e-9, atol=1e-12)
-    got, want = (torch.autograd.grad(one.rgb.square().sum(), list(values.values())) for one in (drawn, listed))
-    for name, gradient, expected in zip(values, got, want, strict=True):
-        assert relative(gradient, expected) < 1e-9, name
+def test_the_public_function_draws_maps_as_the_cpu_does(device: torch.device, cpu) -> None:
+    def draw(where: torch.device) -> tuple[object, list[Tensor]]:
+        values = {name: value.detach().to(where).requires_grad_() for name, value in surfels().items()}
+        drawn = bitymi_ns.rasterize(**values, camera=api_camera().to(where), maps=True)
+        assert drawn.depth is not None and drawn.normal is not None
+        total = drawn.rgb.square().sum() + drawn.depth.square().sum() + drawn.normal[..., 0].sum()
+        return drawn.fragments, [
+            *torch.autograd.grad(total, list(values.values())),
+            drawn.rgb,
+            drawn.depth,
+            drawn.normal,
+        ]
+
+    fragments, got = draw(device)
+    assert isinstance(fragments, Unlisted)
+    with cpu():
+        _, want = draw(HERE)
+    for value, expected in zip(got, want, strict=True):
+        assert relative(value.cpu(), expected) < 1e-9
 
 
 def test_alphas_in_other_tiles_are_refused(device: torch.device) -> None:

@@ -48,12 +48,16 @@ def test_masked_counts_equal_those_of_the_cpu(both) -> None:
     assert torch.equal(got, want) and got.any()
 
 
-@pytest.mark.parametrize(("texture", "maps", "waits"), [(False, False, 1), (False, True, 2), (True, True, 3)])
+@pytest.mark.parametrize(
+    ("texture", "what", "waits"),
+    [(False, {"maps": True}, 1), (False, {"overdraw_half": 0.005}, 2), (True, {"maps": True}, 3)],
+    ids=["no list", "a list", "the field"],
+)
 def test_a_step_waits_for_no_more_than_the_lengths_of_lists(
-    texture: bool, maps: bool, waits: int, device: torch.device
+    texture: bool, what: dict, waits: int, device: torch.device
 ) -> None:
     scene, camera = scene_of(random_scene(40, 5, 33, 21), device, texture)
-    scene.render(camera, maps=maps)  # warm-up, for cached values
+    scene.render(camera, **what)  # warm-up, for cached values
     with Operations() as counted:
-        scene.render(camera, maps=maps).rgb.mean().backward()
+        scene.render(camera, **what).rgb.mean().backward()
     assert counted.waits == waits

@@ -4,7 +4,7 @@ import itertools
 
 import pytest
 
-from bitymi_ns.train.config import DensifyConfig, LearningRates, LossConfig, TexelConfig, TrainConfig
+from bitymi_ns.train.config import DensifyConfig, LearningRates, TexelConfig, TrainConfig
 from bitymi_ns.train.schedules import Schedule
 
 
@@ -35,20 +35,6 @@ def test_reference_run_has_the_published_events():
     for extent in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(ValueError, match="extent"):
             Schedule(TrainConfig(), 100, extent)
-
-
-@pytest.mark.parametrize(
-    ("weights", "maps", "lists"),
-    [
-        ({}, False, False),
-        ({}, True, True),
-        ({"depth_weight": 0.0}, True, True),
-        ({"depth_weight": 0.0, "normal_weight": 0.0}, True, False),
-        ({"overdraw_weight": 0.1}, False, True),
-    ],
-)
-def test_overdraw_depth_and_normals_need_lists(weights: dict[str, float], maps: bool, lists: bool):
-    assert Schedule(TrainConfig(loss=LossConfig(**weights)), 100).lists_fragments(maps) is lists
 
 
 @pytest.mark.parametrize("max_steps", [60, 97, 300, 1000, 1999, 2000, 2500, 3000, 7000, 29_999, 35_000])

@@ -80,11 +80,6 @@ class CaptureFacts:
         per_view = {name: getattr(self, name) for name in ("lenses", "files", "maps", "fitted")}
         return replace(self, **{name: [values[i] for i in indices] for name, values in per_view.items() if values})
 
-    @property
-    def has_maps(self) -> bool:
-        """True if depth or normals of views are used."""
-        return any(maps.fit is not None or maps.files.normal is not None for maps in self.fitted)
-
     def __deepcopy__(self, memo: object) -> CaptureFacts:
         """Return the record itself: nerfstudio's data sets copy the metadata."""
         return self

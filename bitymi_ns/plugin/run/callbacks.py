@@ -94,7 +94,7 @@ class TrainingRun:
         pixels, schedule = [camera.width * camera.height for camera in cameras], self.training.schedule
         mean = sum(pixels) / len(pixels)
         surfels = expected_surfels(schedule, model.first_surfels, mean, self.training.strategy.most)
-        lists = schedule.lists_fragments(facts.has_maps)
+        lists = schedule.config.loss.overdraw_weight > 0.0
         most = max(len(scene), int(surfels[self.first_step :].max(initial=0)))
         state_training(scene, cameras, most, texels, to_come, trainer.world_size, lists)
         held_out = len(self.datamanager.eval_dataset)

@@ -139,7 +139,7 @@ def test_relative_depth_is_fitted_to_the_points(capture, room, inverse, capsys) 
 def test_useless_depth_is_not_used(capture, change, message, capsys) -> None:
     manager = load(capture(change))
     assert message in " ".join(capsys.readouterr().out.split())
-    assert all(view.depth is None for view in manager.train_views) and not manager.train_dataset.facts.has_maps
+    assert all(view.depth is None for view in manager.train_views)
     assert len(manager.train_dataparser_outputs.metadata["points3D_xyz"]) == 400
 
 
@@ -303,7 +303,7 @@ def test_missing_maps_and_switching_off(capture, capsys) -> None:
     assert "1 files of depth_file_path are missing" in " ".join(capsys.readouterr().out.split())
     assert sum(view.depth is None for view in views) == 1
     off = load(folder, depth="off")
-    assert not off.train_dataset.facts.has_maps
+    assert all(view.depth is None for view in off.train_views)
     meta = json.loads((folder / "transforms.json").read_text())
     for frame in meta["frames"]:
         del frame["depth_file_path"]
@@ -328,7 +328,6 @@ def test_normals_of_a_capture(capture, room, capsys) -> None:
         cv2.imwrite(str(folder / frame["normal_file_path"]), image[..., ::-1])
     (folder / "transforms.json").write_text(json.dumps(meta))
     manager = load(folder)
-    assert manager.train_dataset.facts.has_maps
     normal = manager.train_views[0].normal.float()
     assert normal.shape == (HEIGHT, WIDTH, 3) and not normal[:5].any()
     torch.testing.assert_close(normal[20, 20], torch.tensor([0.0, -0.6, -0.8]), atol=0.01, rtol=0)

@@ -1,7 +1,6 @@
 """Differentiable torch operations over the compiled kernels; float64 twins are in `ops.reference`.
 
-Functions take float32 or float64 tensors and dispatch on device and dtype. `baked.draw` draws a baked scene on the CPU
-(`baked_cpu`) or a CUDA device (`baked_renderer`).
+Functions take float32 or float64 tensors and dispatch on device and dtype.
 """
 
 from .bands import Unlisted, draw_by_lists, fitting_lists

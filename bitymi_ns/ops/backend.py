@@ -26,9 +26,8 @@ _emulated = False
 
 @contextmanager
 def emulated_cuda(seed: int = 0) -> Iterator[None]:
-    """Send CPU tensors to the CUDA kernels, run thread by thread on the host. For tests. `seed`: of the order in which
-    the threads of a block run. Raises RuntimeError: the package was built without BITYMI_EMULATED_CUDA (a CMake
-    option)."""
+    """Send CPU tensors to the CUDA kernels, run thread by thread on the host, for tests. `seed`: of the order of a
+    block's threads. Raises KernelsUnavailable: the package was built without BITYMI_EMULATED_CUDA (a CMake option)."""
     global _emulated
     before = _emulated
     load("_emulated").set_seed(seed)
@@ -41,10 +40,9 @@ def emulated_cuda(seed: int = 0) -> Iterator[None]:
 
 @functools.cache
 def cpu_module() -> str:
-    """Return the name of the best module of CPU kernels that this CPU can run.
-
-    Checked before loading, as an unsupported instruction ends the process. Only Linux lists CPU features; elsewhere the
-    first module is used. Raises KernelsUnavailable: this CPU lacks a feature that all modules need."""
+    """Return the name of the best module of CPU kernels that this CPU can run; the first where its features are unknown
+    (outside Linux). Raises KernelsUnavailable: it lacks a feature that all modules need."""
+    # checked before loading, as an unsupported instruction ends the process
     try:
         needs = importlib.import_module("bitymi_ns._cpu_features").FEATURES
         lines = CPUINFO.read_text(encoding="utf8").splitlines()
@@ -66,8 +64,7 @@ def cpu_module() -> str:
 
 @functools.cache
 def load(name: str) -> ModuleType:
-    """Load a compiled module: _cpu, _cuda or _emulated. Starts no thread and changes no setting. Raises
-    KernelsUnavailable: missing, or not for this CPU."""
+    """Load a compiled module: _cpu, _cuda or _emulated. Raises KernelsUnavailable: missing, or not for this CPU."""
     try:
         return importlib.import_module(f"bitymi_ns.{cpu_module() if name == '_cpu' else name}")
     except ImportError as error:
@@ -76,9 +73,8 @@ def load(name: str) -> ModuleType:
             "_cuda": "install the package again where the CUDA toolkit's nvcc is found, or move the tensors to the CPU",
             "_emulated": "install the package with --config-settings=cmake.define.BITYMI_EMULATED_CUDA=ON",
         }[name]
-        raise KernelsUnavailable(
-            f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"
-        ) from (error)
+        what = f"the compiled module bitymi_ns.{name} is missing: {advice}; the import said: {error}"
+        raise KernelsUnavailable(what) from error
 
 
 @functools.cache
@@ -98,7 +94,7 @@ def cuda_backend(device: torch.device) -> bool:
 
 
 def module(device: torch.device) -> ModuleType:
-    """Return the kernel module for a device. Raises RuntimeError: its kernels are not built, or not for this CPU."""
+    """Return the kernel module for a device. Raises RuntimeError: there is none; as `load`."""
     if device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")
     if cuda_backend(device):
@@ -108,8 +104,7 @@ def module(device: torch.device) -> ModuleType:
 
 
 def lookup(name: str, device: torch.device) -> Any:
-    """Return a function or class of the kernel module for a device by name. Raises RuntimeError: the kernels for that
-    device are not built, or lack it."""
+    """Return a function or class of the kernel module for a device. Raises RuntimeError: it lacks it; as `module`."""
     kernel_or_class = getattr(module(device), name, None)
     if kernel_or_class is None:
         raise RuntimeError(f"there is no kernel {name} for tensors on '{device}': move them to another device")
@@ -147,8 +142,8 @@ def _name(name: str, like: Tensor) -> str:
 
 
 def kernel(name: str, like: Tensor) -> Callable[..., Any]:
-    """Return the kernel function `name` for tensors like `like`. Raises TypeError: the dtype is neither float32 nor
-    float64. Raises RuntimeError: the kernels for that device are not built."""
+    """Return the kernel function `name` for tensors like `like`. Raises TypeError: neither float32 nor float64. Raises
+    RuntimeError: as `lookup`."""
     return function(_name(name, like), like.device)
 
 
@@ -166,7 +161,7 @@ def workspace(name: str, like: Tensor, **sizes: int) -> Tensor:
 
 
 def on_device(device: torch.device) -> AbstractContextManager[Any]:
-    """Return a context that makes a CUDA device current, for calls that take no stream."""
+    """Make a CUDA device current, for calls that take no stream."""
     if device.type != "cuda" or device.index == torch.cuda.current_device():
         return _AS_IT_IS
     return torch.cuda.device(device)

@@ -22,12 +22,10 @@ class Bins:
 
 
 def int32s(like: Tensor, *shape: int) -> Tensor:
-    """Allocate int32 numbers on the device of `like`."""
     return torch.empty(shape, dtype=torch.int32, device=like.device)
 
 
 def int64s(like: Tensor, count: int) -> Tensor:
-    """Allocate int64 numbers on the device of `like`."""
     return torch.empty(count, dtype=torch.int64, device=like.device)
 
 
@@ -41,8 +39,7 @@ def check_pair_count(pairs: int, camera: CameraLike) -> None:
 
 
 def tile_lists(geom: Tensor, projection: Projection) -> Bins:
-    """List the pairs of surfel and tile of a view; waits once for their number. Raises RuntimeError: 2^31 pairs or
-    more."""
+    """List the pairs of surfel and tile of a view; waits once for their number. Raises: as `check_pair_count`."""
     camera, n, view = projection.camera, geom.shape[0], projection.view(geom)
     tiles = -(-camera.width // TILE) * -(-camera.height // TILE)
     ranks = {"order": int32s(geom, n), "slot_start": int64s(geom, n + 1)}

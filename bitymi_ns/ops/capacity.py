@@ -13,8 +13,8 @@ NUMBERS = 24
 """Numbers per fragment in a training step: 7 in the list, 3 of its residual, 8 of gradients; the rest is slack."""
 FEW = 1 << 23  # up to this many fragments free memory is not queried
 LISTS_PER_CHECK = 100
-"""Lists between queries of free memory. A query takes a tenth of a training step, and between steps only other programs
-change the answer, as torch keeps a list's memory for the next one."""
+"""Lists between queries of free memory: a query takes a tenth of a training step, and only other programs change the
+answer, as torch keeps a list's memory for the next one."""
 
 
 @dataclass
@@ -30,12 +30,8 @@ _rooms: dict[torch.device, _Room] = {}
 
 
 class TooManyFragments(RuntimeError):
-    """A view with more fragments than allowed.
-
-    Args:
-        count, most: number of fragments, and its limit; also attributes.
-        ids: whether surfel and pixel are stored too: 8 bytes beside 5 numbers of geom's dtype.
-    """
+    """A view with more fragments (`count`) than allowed (`most`). `ids`: surfel and pixel are stored too, 8 bytes
+    beside 5 numbers of geom's dtype."""
 
     def __init__(self, geom: Tensor, projection: Projection, count: int, most: int, ids: bool) -> None:
         size, pixels = 5 * geom.element_size() + 8 * ids, projection.camera.width * projection.camera.height
@@ -70,9 +66,8 @@ def fragment_capacity(geom: Tensor) -> int:
 
 
 def check_capacity(geom: Tensor, projection: Projection, count: int, most: int | None) -> None:
-    """Raise TooManyFragments if a list is longer than allowed or, with most = 0, than memory permits.
-
-    Free memory is queried for a list longer than all before, and every `LISTS_PER_CHECK` lists."""
+    """Raise TooManyFragments if a list is longer than `most` or, with most = 0, than memory permits, which is queried
+    for a list longer than all before, and every `LISTS_PER_CHECK` lists."""
     if most == 0 and geom.device.type == "cuda" and count > FEW:
         room = _rooms.get(geom.device)
         if room is None or count > room.largest or room.lists >= LISTS_PER_CHECK:

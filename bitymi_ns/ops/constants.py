@@ -1,7 +1,4 @@
-"""Constants of the formulas and of the kernels' arrays, read from the compiled module (csrc states each once).
-
-The float64 twins in `ops.reference` state those of the formulas again, as an independent check.
-"""
+"""Constants of the formulas and of the kernels' arrays, read from the compiled module (csrc states each once)."""
 
 from typing import Any
 

@@ -22,8 +22,7 @@ PART = 1 << 20  # fragments summed at a time
 @torch.no_grad()
 def surfel_coverage(projection: Projection, bound: float) -> Tensor:
     """Measure the coverage of each surfel in a view. Returns [N, 3]: largest transmittance in front of a blended
-    fragment; sum of blending weights >= `bound`, pixels; sum of all squared blending weights, pixels. 0 for surfels
-    that are not blended."""
+    fragment; sum of blending weights >= `bound`, and of all squared blending weights, pixels. 0 if not blended."""
     geom = projection.geom.detach()
     shown = geom.new_zeros(len(geom), 3)
     if not cuda_backend(geom.device):
@@ -48,8 +47,6 @@ def add_texel_coverage(
     """Add the coverage of each texel in a view, in pixels.
 
     Args:
-        projection: of an H x W view.
-        tiles: of the T texels.
         mask: [H, W] or [H, W, 1] bool, True for pixels that count; None: all.
         bound: fragments of smaller weight are ignored.
         covered: [T, 2] of the tiles' dtype, contiguous; increased by the sums over fragments of w b and w^2 b, with
@@ -80,8 +77,8 @@ def _sum_fragments(name: str, projection: Projection, bound: float, **arguments:
 def _add_of_list(
     fragments: Fragments, tiles: TexelTiles, mask: Tensor | None, bound: float, total: Tensor, squares: Tensor
 ) -> None:
-    """Add the coverage by listed fragments to total [T, 3] (equal columns) and squares [T] on CUDA: a backward pass of
-    blending with image gradient 1 and texel rate -1."""
+    """Add the coverage by listed fragments to total [T, 3] (equal columns) and squares [T]: a backward pass of blending
+    with image gradient 1 and texel rate -1."""
     like, surfels, pixels = tiles.extent, fragments.surfels, fragments.width * fragments.height
     counts = like.new_ones(pixels) if mask is None else mask.to(like.dtype)
     base, geom = like.new_zeros(surfels, 3), like.new_zeros(surfels, GEOM)

@@ -18,8 +18,8 @@ class FieldGeometry:
     """Placement of the hash grid in the world."""
 
     min_resolution: int  # cells along an edge of the coarsest level; each level doubles it
-    # mip-NeRF 360 contraction: the unit ball around `mid` of radius `half` is kept, the space outside maps into the
-    # shell up to radius 2. Without it, positions are clamped to the cube of half edge `half`
+    # mip-NeRF 360 contraction: the ball around `mid` of radius `half` is kept, the space outside maps into the shell up
+    # to twice that. Without it, positions are clamped to the cube of half edge `half`
     contract: bool
     mid: tuple[float, float, float]  # centre, world units
     half: float  # radius or half edge, world units
@@ -67,16 +67,12 @@ class _Field(torch.autograd.Function):
 
 
 def field(x: Tensor, geometry: FieldGeometry, table: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:
-    """Evaluate the residual colour at world positions, eq. (color): levels interpolated trilinearly, concatenated and
-    decoded by an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
+    """Evaluate the residual colour [M, 3], unbounded, at world positions x [M, 3], eq. (color): levels interpolated
+    trilinearly, concatenated and decoded by an MLP with two hidden layers of 16 ReLU units, no biases, linear output.
 
     Args:
-        x: [M, 3] world positions.
         table: [levels, T, 4] features, T a power of two; cells are hashed by XOR of coordinate times prime.
         w1, w2, w3: [4 levels, 16], [16, 16], [16, 3] weights, input-major.
-
-    Returns:
-        [M, 3] residual, unbounded.
     """
     on_same_device(x, field_table=table, field_w1=w1, field_w2=w2, field_w3=w3)
     return _Field.apply(x, geometry, table, w1, w2, w3)
@@ -90,17 +86,13 @@ def fragment_residual(
     bound: float = 0.0,
     move_surfels: bool = False,
 ) -> Tensor:
-    """Evaluate rho(x) at fragments, x = mean + u s_u t_u + v s_v t_v.
+    """Evaluate rho(x) [F, 3] at fragments, x = mean + u s_u t_u + v s_v t_v.
 
     Args:
-        fragments: F fragments.
         frames: [N, 9] of the projection.
         geometry, weights: the field (table, w1, w2, w3), as in `field`.
         bound: fragments of smaller weight get 0.
         move_surfels: propagate the gradient of rho with respect to x to uv and frames.
-
-    Returns:
-        [F, 3], 0 below the bound.
 
     Raises:
         ValueError: shapes or devices do not match.

@@ -73,4 +73,3 @@ GEOMETRY_PARAMETERS: dict[str, Parameter] = {
 }
 """Geometry of a surfel by name, in the order of the kernels."""
 GEOMETRY = tuple(GEOMETRY_PARAMETERS)
-"""Names of the surfels' geometry parameters."""

@@ -59,10 +59,9 @@ class Projection:
     u = (u1 dx + u2 dy) / W, v = (v1 dx + v2 dy) / W, W = w0 + w1 dx + w2 dy, at depth z w0 / W (csrc/core/surfel.h).
 
     Attributes:
-        geom: [N, 16], differentiable.
+        geom: [N, 16] (`constants.GEOM`), differentiable.
         frames: [N, 9] mean, s_u t_u, s_v t_v in the world frame, differentiable.
         radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0: not visible.
-        camera: the camera.
         near: nearest depth that is drawn, camera z.
         photo_pixel: side of a photograph's pixel in pixels of the view; if not 1, only the baked renderer can use it.
         broken: [1] int32, number of surfels dropped because a parameter is NaN or infinite.
@@ -99,7 +98,7 @@ class Projection:
             self.whole.mean2d_absgrad += absgrad
 
     def view(self, geom: Tensor) -> dict[str, Any]:
-        """Build the kernels' arguments for a view (`View` of csrc/ops/visibility.h). `geom`: `self.geom`, detached."""
+        """The kernels' arguments for a view (`View` of csrc/ops/visibility.h). `geom`: `self.geom`, detached."""
         size = {"width": self.camera.width, "height": self.camera.height}
         drawn = {"near": self.near, "photo_pixel": self.photo_pixel}
         return dict(geom=geom, radii=self.radii, **size, **drawn)
@@ -111,7 +110,7 @@ class Projection:
 
     @property
     def not_finite(self) -> int:
-        """`broken` as an int; waits for the device."""
+        """Number of broken surfels; waits for the device."""
         return int(self.broken)
 
     @cached_property
@@ -162,20 +161,11 @@ class _Project(torch.autograd.Function):
 
 
 def rigid_gradient(means: Tensor, quats: Tensor, dmeans: Tensor, dquats: Tensor, viewmat: Tensor) -> Tensor:
-    """Compute the gradient of a camera's pose from the gradients of the surfels.
+    """Compute the gradient of a camera's pose `viewmat` [4, 4], restricted to rigid motions, from the gradients
+    `dmeans` [N, 3] and `dquats` [N, 4] of the surfels, without the view colours' part.
 
     Moving the camera moves the surfels rigidly the other way in its frame: the force on the surfels is the sum of their
     gradients, the torque that of means x dmeans and of the quaternions' rotational part. Sums are in float64.
-
-    Args:
-        means: [N, 3] world positions.
-        quats: [N, 4] wxyz of any length.
-        dmeans: [N, 3] gradients of the image, without the view colours' part.
-        dquats: [N, 4] likewise.
-        viewmat: [4, 4] world to camera.
-
-    Returns:
-        [4, 4] in the dtype of `viewmat`: the gradient restricted to rigid motions.
     """
     # surfels that are not finite are not drawn and have gradients of 0
     m, q = (t.double().nan_to_num(0.0, 0.0, 0.0) for t in (means, quats))
@@ -198,8 +188,8 @@ def refuse_skew(camera: CameraLike) -> None:
 
 
 def geometry_of(surfels: Tensors) -> list[Tensor]:
-    """List the surfels' parameters of `GEOMETRY`; one that is missing has the value `Parameter.absent`. Raises
-    KeyError: it has none."""
+    """List the surfels' parameters of `GEOMETRY`, missing ones with `Parameter.absent`. Raises KeyError: it has
+    none."""
     means, geometry = surfels["means"], []
     for name, parameter in GEOMETRY_PARAMETERS.items():
         if name in surfels or parameter.absent is None:
@@ -237,7 +227,7 @@ def project(
         log_scales: [N, 2] natural logarithm of the tangent scales, world units; clamped to +-30.
         opacity_logits: [N], opacity = sigmoid.
         beta_raw: [N], beta = 4 sigmoid (eq. beta-kernel).
-        camera: OpenCV axes; its `viewmat` may require a gradient (along rigid motions).
+        camera: its `viewmat` may require a gradient (along rigid motions).
         near: surfels with a centre nearer than this (camera z) are dropped.
         photo_pixel: side of a photograph's pixel in pixels of the view (csrc/core/resize.h); if not 1, for the baked
             renderer on the CPU only and without gradients. The last column of geom is then the height of the low pass
@@ -245,8 +235,7 @@ def project(
         alpha: alpha texels; None: opaque.
 
     Raises:
-        ValueError: shapes or devices do not match, the camera has skew, or a photo_pixel other than 1 is combined with
-            gradients or a CUDA device.
+        ValueError: as `checked_geometry`, or photo_pixel is not 1 with gradients or on a CUDA device.
     """
     if photo_pixel != 1.0 and (cuda_backend(means.device) or (torch.is_grad_enabled() and means.requires_grad)):
         raise ValueError("surfels are resized on the CPU and without gradients alone")

@@ -26,10 +26,8 @@ class _Ssim(torch.autograd.Function):
 
 
 def ssim(a: Tensor, b: Tensor) -> Tensor:
-    """Compute the mean SSIM over the valid 11 x 11 Gaussian windows (sigma 1.5), K1 = 0.01, K2 = 0.03, data range 1.
-
-    Differentiable in a. Images smaller than a window give 1. `a` and `b`: [H, W, C] in [0, 1]. Returns scalar
-    tensor."""
+    """Compute the mean SSIM, a scalar tensor, of images [H, W, C] in [0, 1] over the valid 11 x 11 Gaussian windows
+    (sigma 1.5), K1 = 0.01, K2 = 0.03; 1 for images smaller than a window. Differentiable in `a`."""
     if a.shape != b.shape or a.dim() != 3:
         raise ValueError(f"ssim compares two [H, W, C] images of one size, not {list(a.shape)} and {list(b.shape)}")
     return _Ssim.apply(a, b)

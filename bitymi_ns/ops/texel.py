@@ -12,10 +12,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class TexelTiles:
-    """Offsets, sizes and extents of the surfels' tiles in a texel list [T, 3].
+    """The surfels' tiles in a texel list [T, 3].
 
     Texel (i, j) of surfel s, i along u and j along v, is row first[s] + j r_u + i; its centre lies at
-    u = (i + 0.5) / r_u * 2e - e, v likewise. A tile of 1 x 1 texel is a constant.
+    u = (i + 0.5) / r_u * 2e - e, v likewise.
 
     Attributes:
         first: [N] int64.
@@ -41,7 +41,7 @@ class TexelTiles:
 
     @property
     def arrays(self) -> dict[str, Tensor]:
-        """Build the kernels' arguments, by name."""
+        """The kernels' arguments, by name."""
         return {"first": self.first, "size": self.size, "extent": self.extent}
 
     @functools.cached_property
@@ -71,7 +71,6 @@ class TexelAlpha:
         return TexelAlpha(tiles, self.values[self.tiles.rows_of(surfels)], self.bound)
 
     def to(self, device: torch.device | str) -> TexelAlpha:
-        """Move to a device."""
         tiles = TexelTiles(*(t.to(device) for t in (self.tiles.first, self.tiles.size, self.tiles.extent)))
         return TexelAlpha(tiles, self.values.to(device), self.bound)
 
@@ -83,28 +82,22 @@ class TexelAlpha:
 
 @dataclass(frozen=True)
 class TexelDescent:
-    """Texel step of a backward pass: texel t moves by -rate share[t] times its gradient.
+    """Texel step of a backward pass: texel t moves by -rate share[t] times its gradient."""
 
-    Attributes:
-        share: [T] of the texels' dtype.
-        rate: common step length.
-        moved: [T, 3] texels to update; None: those that are read.
-    """
-
-    share: Tensor
+    share: Tensor  # [T] of the texels' dtype
     rate: float
-    moved: Tensor | None = None
+    moved: Tensor | None = None  # [T, 3] texels to update; None: those that are read
 
     def arguments(self, read: Tensor) -> dict[str, Any]:
-        """Build the kernels' keywords for a backward pass that reads texels `read`."""
+        """The kernels' arguments for a backward pass that reads texels `read`."""
         return {"moved": read if self.moved is None else self.moved, "share": self.share, "rate": self.rate}
 
 
 def gradient_or_step(
     texels: Tensor, learns: bool, descent: TexelDescent | None
 ) -> tuple[Tensor | None, dict[str, Any]]:
-    """Prepare the backward pass of texels [T, 3]: a zero gradient [T, 3] to fill, None unless they learn; and the
-    kernels' keywords, with `moved` if there is a gradient or a descent."""
+    """Prepare the backward pass of texels [T, 3]: a zero gradient [T, 3] to fill, None unless they learn, and the
+    kernels' arguments."""
     if not learns:
         return None, {"rate": 0.0} if descent is None else descent.arguments(texels)
     dtexels = torch.zeros_like(texels)

@@ -20,29 +20,19 @@ _pool = functools.cache(Pool)
 
 
 def tracers(like: Tensor) -> Pool[Any]:
-    """Return reusable tracers for tensors like `like`, which keep their memory between views."""
+    """Tracers for tensors like `like`, which keep their memory between views."""
     return _pool(kernel_class("Trace", like))
 
 
 @functools.cache
 def tile_lists() -> Pool[Any]:
-    """Return reusable memory for the tile lists of views whose fragments are not listed."""
+    """Memory for the tile lists of views whose fragments are not listed."""
     return Pool(module(torch.device("cpu")).Bins)
 
 
 def find_fragments(geom: Tensor, projection: Projection, most: int | None = None) -> tuple[Layout, dict[str, Tensor]]:
-    """Find the fragments of a view.
-
-    Args:
-        geom: [N, 16], detached.
-        most: largest number of fragments; 0: `MOST`; None: no limit.
-
-    Returns:
-        layout, and the numbers of `Fragments` by name.
-
-    Raises:
-        TooManyFragments: there are more than `most`, or, with a limit, than memory holds.
-    """
+    """Find the fragments of a view: their layout, and the numbers of `Fragments` by name. Raises TooManyFragments: more
+    than `most` (0: `MOST`; None: no limit), or, with a limit, than memory holds."""
     most = MOST if most == 0 else most or 0
     with tracers(geom).borrow() as tracer:
         n = tracer.run(**projection.view(geom), **projection.alpha_arrays, most=most)
@@ -62,13 +52,7 @@ def find_fragments(geom: Tensor, projection: Projection, most: int | None = None
 def select(
     layout: Layout, numbers: dict[str, Tensor], keep: Tensor, width: int, height: int
 ) -> tuple[Layout, dict[str, Tensor]]:
-    """Select fragments of a list; returns their layout and numbers, as `find_fragments` does.
-
-    Args:
-        layout, numbers: of a list of F fragments.
-        keep: [F] bool.
-        width, height: of the image, pixels.
-    """
+    """Select the fragments of a list with `keep` [F]; returns their layout and numbers, as `find_fragments` does."""
     listed = empty_list(numbers["weight"], int(keep.sum()))
     arrays = _empty_layout(len(layout.arrays["tile_start"]) - 1, len(layout.arrays["blocks"]))
     kept = {f"kept_{name}": values for name, values in listed.items()}
@@ -96,8 +80,7 @@ def _layout(arrays: dict[str, Tensor], width: int, height: int) -> Layout:
 
 
 def count(projection: Projection) -> int:
-    """Count the fragments of a view on the CPU without making their list. Raises RuntimeError: the projection is not on
-    the CPU."""
+    """Count the fragments of a view on the CPU without making their list."""
     geom = projection.geom.detach()
     with tracers(geom).borrow() as tracer:
         return tracer.run(**projection.view(geom), **projection.alpha_arrays, most=1)

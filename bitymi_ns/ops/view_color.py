@@ -11,7 +11,7 @@ from .parameters import Tensors
 from .view_kinds import entry_of
 
 REDUCED = ("view_base", "view_span", "view_terms")
-"""Parameter names of reduced view colours, which have a varying number of terms per surfel."""
+"""Parameters of reduced view colours, with a varying number of terms per surfel."""
 
 
 def view_base(f_view: Tensor) -> Tensor:
@@ -59,8 +59,8 @@ class _ViewColor(torch.autograd.Function):
 
 
 def check_view_color(kind: str, params: Tensors, n: int) -> int:
-    """Check the view colours of n surfels; returns the number of terms (sites, coefficients with dc, or lobes). Raises
-    ValueError: unknown kind, or a parameter has the wrong shape."""
+    """Check the view colours of n surfels; returns the number of terms. Raises ValueError: unknown kind, or a parameter
+    has the wrong shape."""
     entry = entry_of(kind)
     terms = entry.terms(params)
     rows = [(n, *shape) for shape in entry.shapes(terms)]
@@ -93,9 +93,9 @@ def view_color(kind: str, params: Tensors, means: Tensor, center: Tensor, active
     """Compute f_view(d) without the offset 0.5, d = (mean - centre) / |mean - centre| in the world frame.
 
     Args:
-        kind: a name of `VIEW_COLORS`; sv is the paper's.
+        kind: a name of `VIEW_COLORS`.
         params: the parameters of its entry; or those of reduced colours, without gradient: view_base [N, 3], view_span
-            [N, 2] int32 (first term, number of terms), view_terms [terms, reduced_width]. Others are ignored.
+            [N, 2] int32 (first term, number of terms), view_terms [terms, reduced_width].
         means: [N, 3] world positions.
         center: [3] camera centre, world; used in float64 (`Camera.exact_center`); may require a gradient.
         active: [N] bool; inactive rows give 0 and get no gradient; None: all active.

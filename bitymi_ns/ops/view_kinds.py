@@ -54,7 +54,6 @@ class ViewColor:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Names of the parameters."""
         return tuple(parameter.name for parameter in self.parameters)
 
     @property
@@ -67,7 +66,6 @@ class ViewColor:
         return [params[name] for name in self.names]
 
     def terms(self, params: Tensors) -> int:
-        """Count the terms."""
         return params[self.names[1]].shape[1] + self._in_first
 
     def shapes(self, terms: int) -> list[tuple[int, ...]]:
@@ -95,7 +93,6 @@ def _sv_start(color: Tensor, sites: int, generator: torch.Generator) -> tuple[Te
 
 
 def _sv_sites(sites: Tensor, log_tau: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute tau_k s_k, the gradients of the logits, and the colours."""
     return F.normalize(sites, dim=2) * log_tau.clamp(max=LOG_TAU_MAX).exp()[..., None], rgb
 
 
@@ -112,8 +109,7 @@ def _sb_start(color: Tensor, lobes: int, generator: torch.Generator) -> tuple[Te
 
 
 _SB_LOBE_MEAN = 0.1 * 0.1
-"""Mean of a fresh Spherical Beta lobe over all directions: softplus(0) = 0.1 times the mean of max(0, cos)^4 over the
-sphere, 0.1."""
+"""Mean of a new Spherical Beta lobe over the sphere: softplus(0) = 0.1 times the mean 0.1 of max(0, cos)^4."""
 
 
 def _sb_mean(base: Tensor, lobes: Tensor) -> Tensor:
@@ -222,7 +218,7 @@ PARAMETERS: dict[str, Parameter] = {
     **GEOMETRY_PARAMETERS,
     **{p.name: p for kind in VIEW_COLORS.values() for p in kind.parameters},
 }
-"""All parameters of a surfel, with the view colours of all kinds, by name."""
+"""All parameters of a surfel by name, with the view colours of all kinds."""
 Kind = Literal["sv", "sh", "sb", "sg"]
 """Names of `VIEW_COLORS`, for options and files checked by type."""
 
@@ -243,7 +239,7 @@ def kind_of(params: Tensors) -> Kind:
 
 
 def fibonacci_sphere(n: int) -> Tensor:
-    """Return [n, 3] float32 unit vectors, evenly distributed over the sphere along a Fibonacci spiral."""
+    """Return unit vectors [n, 3] float32, evenly distributed along a Fibonacci spiral."""
     i = torch.arange(n, dtype=torch.float64)
     z = 1.0 - (2.0 * i + 1.0) / n
     phi = i * math.pi * (3.0 - math.sqrt(5.0))

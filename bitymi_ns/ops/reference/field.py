@@ -9,10 +9,10 @@ PRIMES = (1, 2654435761, 805459861)
 
 
 def contract(x: Tensor, mid: Tensor, half: Tensor | float, contraction: bool = True) -> Tensor:
-    """Map world positions x [M, 3] to grid coordinates [M, 3] in [0, 1].
+    """Map world positions [M, 3] to grid coordinates [M, 3] in [0, 1].
 
-    p = (x - mid) / half. With contraction (mip-NeRF 360, Barron et al. 2022, eq. 10): p stays where |p| <= 1, else
-    becomes (2 - 1/|p|) p/|p|, and (p + 2) / 4 is the grid coordinate. Without: (p + 1) / 2, clamped to [0, 1].
+    p = (x - mid) / half. With contraction (mip-NeRF 360, Barron et al. 2022, eq. 10): p becomes (2 - 1/|p|) p/|p| where
+    |p| > 1, and (p + 2) / 4 is the grid coordinate. Without: (p + 1) / 2, clamped to [0, 1].
     """
     p = (x - mid) / half
     if not contraction:
@@ -24,25 +24,16 @@ def contract(x: Tensor, mid: Tensor, half: Tensor | float, contraction: bool = T
 
 
 def hash_index(corner: Tensor, table_size: int) -> Tensor:
-    """Hash integer grid corners [M, 3] int64 to table rows [M]: XOR of coordinate times prime (uint32), mod table_size.
-
-    (Mueller et al. 2022, eq. 4.)
-    """
+    """Hash grid corners [M, 3] int64 to table rows [M]: XOR of coordinate times prime (uint32), mod table_size (Mueller
+    et al. 2022, eq. 4)."""
     product = (corner * torch.tensor(PRIMES)) & 0xFFFFFFFF
     return (product[:, 0] ^ product[:, 1] ^ product[:, 2]) & (table_size - 1)
 
 
 def encode(c: Tensor, table: Tensor, min_resolution: int = 256) -> Tensor:
-    """Interpolate features trilinearly at grid coordinates c [M, 3] in [0, 1]: [M, L F], level-major.
-
-    Level l has resolution R_l = min_resolution 2^l; the position is c R_l, its cell the floor of that. All levels are
-    hashed.
-
-    Args:
-        c: [M, 3].
-        table: [L, T, F], T a power of two.
-        min_resolution: resolution of level 0.
-    """
+    """Interpolate the features of a table [L, T, F], T a power of two, trilinearly at grid coordinates c [M, 3] in
+    [0, 1]: [M, L F], level-major. Level l has resolution R_l = min_resolution 2^l; the position is c R_l, its cell the
+    floor of that. All levels are hashed."""
     features = []
     for level in range(table.shape[0]):
         position = c * (min_resolution * 2**level)
@@ -58,7 +49,7 @@ def encode(c: Tensor, table: Tensor, min_resolution: int = 256) -> Tensor:
 
 
 def mlp(features: Tensor, w1: Tensor, w2: Tensor, w3: Tensor) -> Tensor:
-    """Evaluate relu(relu(features @ w1) @ w2) @ w3: [M, L F] to [M, 3], no biases, linear output."""
+    """Decode features [M, L F] to [M, 3]."""
     return torch.relu(torch.relu(features @ w1) @ w2) @ w3
 
 
@@ -73,5 +64,5 @@ def field(
     min_resolution: int = 256,
     contraction: bool = True,
 ) -> Tensor:
-    """Evaluate the residual colour rho(x) [M, 3] at world positions x [M, 3]; see `contract`, `encode` and `mlp`."""
+    """Evaluate the residual colour rho(x) [M, 3] at world positions [M, 3]."""
     return mlp(encode(contract(x, mid, half, contraction), table, min_resolution), w1, w2, w3)

@@ -11,13 +11,13 @@ NORM_FLOOR = 1e-12
 
 
 def unit(x: Tensor) -> Tensor:
-    """Normalise `x` [..., C]; lengths below 1e-12 are divided by 1e-12."""
+    """Normalise [..., C]; lengths below 1e-12 are divided by 1e-12."""
     return torch.nn.functional.normalize(x, dim=-1, eps=NORM_FLOOR)
 
 
 def rotation(quats: Tensor) -> Tensor:
     """Convert quaternions wxyz [N, 4] of any length to rotation matrices [N, 3, 3]."""
-    largest = quats.detach().abs().amax(-1, keepdim=True)  # scaled to about 1 first, so that no length underflows
+    largest = quats.detach().abs().amax(-1, keepdim=True)  # so that no length underflows
     w, x, y, z = unit(quats / torch.where(largest > 0, largest, torch.ones_like(largest))).unbind(-1)
     rows = [
         torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)], -1),
@@ -53,18 +53,9 @@ def project(
 ) -> Projection:
     """Compute homography, centre and kernel parameters of each surfel (2DGS: Huang et al. 2024, eq. 5 to 9).
 
-    A surfel's point is mean + u s_u t_u + v s_v t_v, with t_u, t_v the first two columns of its rotation. M's columns
-    are K times the camera-frame s_u t_u, s_v t_v and mean.
-
-    Args:
-        means: [N, 3] world.
-        quats: [N, 4] wxyz, any length; a surfel whose quaternion is 0 is not valid.
-        log_scales: [N, 2] natural logarithm of the world-space tangent scales, clamped to +-30.
-        opacity_logits: [N], opacity = sigmoid.
-        beta_raw: [N], beta = 4 sigmoid.
-        viewmat: [4, 4] world to camera, OpenCV axes.
-        K: [3, 3] intrinsics in pixels.
-        near: surfels whose centre has camera z <= near are not valid.
+    Arguments are those of `ops.project`; `viewmat` [4, 4] and `K` [3, 3] are a camera's. A surfel's point is
+    mean + u s_u t_u + v s_v t_v, with t_u, t_v the first two columns of its rotation. M's columns are K times the
+    camera-frame s_u t_u, s_v t_v and mean.
     """
     R = rotation(quats)  # [N, 3, 3]
     tangents = R[:, :, :2] * log_scales.clamp(-LOG_SCALE_MAX, LOG_SCALE_MAX).exp()[:, None, :]  # [N, 3, 2] world

@@ -13,7 +13,7 @@ from .trace import SUPPORT, Trace, trace
 
 @dataclass
 class Render:
-    """Rendered images; sums run over the blended fragments and are not divided by alpha."""
+    """Rendered images; sums over the blended fragments, not divided by alpha."""
 
     rgb: Tensor  # [H, W, 3] sum of w c, plus the background times the remaining transmittance
     alpha: Tensor  # [H, W] sum of w
@@ -25,21 +25,13 @@ class Render:
 
 
 def texel_centers(resolution: int) -> Tensor:
-    """Compute the texel centres along an axis in surfel coordinates: (i + 0.5) / r * 6 - 3, [resolution] float64."""
+    """Compute the texel centres along an axis, (i + 0.5) / r * 6 - 3 in surfel coordinates: [resolution] float64."""
     return (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution * (2 * SUPPORT) - SUPPORT
 
 
-def texel(tile: Tensor, uv: Tensor, of: Tensor | None = None) -> Tensor:
-    """Fetch the colour of a tile at surfel coordinates: bilinear between texel centres, constant beyond the outer ones.
-
-    Args:
-        tile: [r_v, r_u, C], or K of them; a tile covers the support square [-3, 3]^2.
-        uv: [M, 2] in scale units.
-        of: [M] index of the tile, for K tiles.
-
-    Returns:
-        [M, C].
-    """
+def texel(tile: Tensor, uv: Tensor, which: Tensor | None = None) -> Tensor:
+    """Fetch colours [M, C] from a tile [r_v, r_u, C], which covers the support square [-3, 3]^2, at surfel coordinates
+    [M, 2]: bilinear between texel centres, constant beyond the outer ones. `which`: [M] index among several tiles."""
     rows, columns = tile.shape[-3:-1]
     size = torch.tensor([columns, rows], dtype=uv.dtype, device=uv.device)
     position = (uv.clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # [M, 2] texels
@@ -47,9 +39,9 @@ def texel(tile: Tensor, uv: Tensor, of: Tensor | None = None) -> Tensor:
     low = position.detach().floor().long()
     high = torch.minimum(low + 1, size.long() - 1)
     fu, fv = (position - low)[:, :, None].unbind(1)  # [M, 1]
-    which = () if of is None else (of,)
-    top = tile[(*which, low[:, 1], low[:, 0])] * (1 - fu) + tile[(*which, low[:, 1], high[:, 0])] * fu
-    bottom = tile[(*which, high[:, 1], low[:, 0])] * (1 - fu) + tile[(*which, high[:, 1], high[:, 0])] * fu
+    first = () if which is None else (which,)
+    top = tile[(*first, low[:, 1], low[:, 0])] * (1 - fu) + tile[(*first, low[:, 1], high[:, 0])] * fu
+    bottom = tile[(*first, high[:, 1], low[:, 0])] * (1 - fu) + tile[(*first, high[:, 1], high[:, 0])] * fu
     return top * (1 - fv) + bottom * fv
 
 
@@ -77,14 +69,13 @@ def render(
     """Render surfels. Colour of a fragment: ReLU(f_view + 0.5), with texture ReLU(that + texture).
 
     Args:
-        geometry: means, quats, log_scales, opacity_logits, beta_raw, see `project`.
+        geometry: as for `project`.
         colors: [N, 3] view-dependent colour f_view(d) of each surfel, without the 0.5.
-        camera: viewmat, K, see `project`, and the image size in pixels.
         background: [3]; None: black.
         tiles: a texture tile [r_v, r_u, 3] per surfel, or [r_v, r_u, 4] with factors of sigma.
         residual: residual colour field, world positions [M, 3] to colours [M, 3]; instead of `tiles`.
-        near: see `project`.
-        rim: see `trace`.
+        near: as for `project`.
+        rim: as for `trace`.
     """
     width, height = camera.width, camera.height
     p = project(*geometry, viewmat=camera.viewmat, K=camera.K, near=near)

@@ -16,7 +16,7 @@ TRANSMITTANCE_MIN = 1e-4
 
 @dataclass
 class Trace:
-    """Dense blending weights: P pixels (row-major, y * width + x) against N surfels in input order."""
+    """Dense blending weights: P pixels (y * width + x) against N surfels in input order."""
 
     weight: Tensor  # [P, N] w = sigma T, 0 where not blended
     uv: Tensor  # [P, N, 2] scale units; clamped to the support in the low-pass branch, 0 without a hit
@@ -28,7 +28,7 @@ class Trace:
 
 
 def pixel_centers(width: int, height: int) -> Tensor:
-    """Return the sample positions [H W, 2] float64 in pixels, (i + 0.5, j + 0.5), row-major."""
+    """Return the sample positions (i + 0.5, j + 0.5) [H W, 2] float64, pixels, row-major."""
     y, x = torch.meshgrid(
         torch.arange(height, dtype=torch.float64), torch.arange(width, dtype=torch.float64), indexing="ij"
     )
@@ -50,11 +50,9 @@ def _jacobian(projection: Projection) -> tuple[Tensor, Tensor]:
 
 
 def _resized(projection: Projection, photo_pixel: float) -> tuple[Tensor, Tensor, float, float]:
-    """Resize surfels for a view in which a photograph's pixel has the side `photo_pixel` (docs/numerics.md).
-
-    Returns, with J = d pixel / d (u, v) at the centre: the factor of (u, v) [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and
-    of the kernel's height [N]; the low pass's squared radius, and the factor of its height.
-    """
+    """Resize surfels for a view in which a photograph's pixel has the side `photo_pixel` (docs/numerics.md). Returns
+    the factor of (u, v) [N, 2, 2], (1 + c' J^-1 J^-T)^(-1/2), and of the kernel's height [N]; the low pass's squared
+    radius, and the factor of its height."""
     variance = max(0.0, (1 - photo_pixel**2) / 12)
     radius2 = photo_pixel**2 + 2 * variance
     J, _ = _jacobian(projection)
@@ -83,11 +81,11 @@ def trace(
     c.z, at camera depth M2 . (u, v, 1). Then sigma = min(0.99, o G) with the kernel
     G = max((1 - (u^2 + v^2) / 9)+^beta, exp(-d^2)), d the distance in pixels to the projected centre. A ray parallel to
     the surfel, or meeting it at a depth <= near, has no hit: the first term is 0 there and u = v = 0.
-    A fragment is skipped if sigma < 1/255 or its surfel is not valid. Surfels are blended in the order of their
-    centres' depths (equal depths: by index); the one that would reduce the transmittance below 1e-4 is not blended and
-    ends the pixel. `rim` bounds 1 - x from below in the kernel's derivative only, as in the compiled kernels.
-    `photo_pixel` is the side of a photograph's pixel in pixels of the view (`_resized`). Sigma is
-    multiplied by `factor`, up to 0.99: [P, N] from uv [P, N, 2] and a mask of needed entries [P, N].
+    A fragment is skipped if sigma < 1/255 or its surfel is not valid. Surfels are blended by the depths of their
+    centres (equal depths: by index); the one that would reduce the transmittance below 1e-4 is not blended and ends the
+    pixel. `rim` bounds 1 - x from below in the kernel's derivative only. `photo_pixel` is the side of a photograph's
+    pixel in pixels of the view. Sigma is multiplied by `factor`, up to 0.99: [P, N] from uv [P, N, 2] and a mask of
+    needed entries [P, N].
     """
     pixels = pixel_centers(width, height)  # [P, 2]
     M = projection.M

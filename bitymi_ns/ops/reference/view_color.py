@@ -1,4 +1,7 @@
-"""View-dependent surfel colour in float64: Spherical Voronoi, spherical harmonics, Spherical Beta, Gaussians."""
+"""View-dependent surfel colour in float64: Spherical Voronoi, spherical harmonics, Spherical Beta, Gaussians.
+
+`dirs` are unit view directions [N, 3], world frame, from the camera to the surfel; colours are [N, 3].
+"""
 
 import math
 
@@ -18,20 +21,14 @@ def sv(sites: Tensor, log_tau: Tensor, rgb: Tensor, dirs: Tensor) -> Tensor:
         sites: [N, K, 3] site vectors, normalised to s_k; a site of length 0 has logit 0.
         log_tau: [N, K] natural logarithm of the temperatures.
         rgb: [N, K, 3].
-        dirs: [N, 3] unit view directions, world frame, from the camera to the surfel.
-
-    Returns:
-        [N, 3], any sign.
     """
     logits = log_tau.exp() * (unit(sites) * dirs[:, None]).sum(-1)  # [N, K]
     return (torch.softmax(logits, dim=-1)[..., None] * rgb).sum(1)
 
 
 def sh_basis(degree: int, dirs: Tensor) -> Tensor:
-    """Evaluate real spherical harmonics at unit vectors [N, 3], degree 0 to 3: [N, (degree + 1)^2].
-
-    Order l, m = -l .. l, with the Condon-Shortley sign (-1)^m, as in 3DGS: Y_1 = sqrt(3 / 4 pi) (-y, z, -x).
-    """
+    """Evaluate real spherical harmonics up to degree 3: [N, (degree + 1)^2], in the order l, m = -l .. l, with the
+    Condon-Shortley sign (-1)^m, as in 3DGS: Y_1 = sqrt(3 / 4 pi) (-y, z, -x)."""
     x, y, z = dirs.unbind(-1)
     pi = math.pi
     basis = [torch.full_like(x, math.sqrt(1 / (4 * pi)))]
@@ -61,12 +58,10 @@ def sh_basis(degree: int, dirs: Tensor) -> Tensor:
     return torch.stack(basis, dim=-1)
 
 
-def sh(dc: Tensor, rest: Tensor, dirs: Tensor, degree: int | None = None) -> Tensor:
-    """Evaluate spherical harmonics from dc [N, 3] and rest [N, >= (degree + 1)^2 - 1, 3] at unit dirs [N, 3]: [N, 3].
-    Without `degree`, all coefficients are used."""
-    if degree is None:
-        degree = math.isqrt(rest.shape[1] + 1) - 1
-    coefficients = torch.cat([dc[:, None], rest[:, : (degree + 1) ** 2 - 1]], dim=1)
+def sh(dc: Tensor, rest: Tensor, dirs: Tensor) -> Tensor:
+    """Evaluate spherical harmonics from dc [N, 3] and rest [N, (degree + 1)^2 - 1, 3]."""
+    coefficients = torch.cat([dc[:, None], rest], dim=1)
+    degree = math.isqrt(coefficients.shape[1]) - 1
     return (sh_basis(degree, dirs)[..., None] * coefficients).sum(1)
 
 
@@ -75,13 +70,7 @@ def sb(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
 
     mu = (sin t cos p, sin t sin p, cos t); softplus(x) = log(1 + exp(a x)) / a with a = 10 ln 2, so softplus(0) = 0.1.
 
-    Args:
-        base: [N, 3].
-        lobes: [N, K, 6], columns r, g, b, theta, phi, b.
-        dirs: [N, 3] unit view directions, world frame, from the camera to the surfel.
-
-    Returns:
-        [N, 3].
+    `base`: [N, 3]; `lobes`: [N, K, 6], columns r, g, b, theta, phi, b.
     """
     theta, phi, b = lobes[..., 3], lobes[..., 4], lobes[..., 5]  # [N, K]
     mu = torch.stack([theta.sin() * phi.cos(), theta.sin() * phi.sin(), theta.cos()], dim=-1)  # [N, K, 3]
@@ -94,13 +83,7 @@ def sb(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
 def sg(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
     """Evaluate Spherical Gaussians: base + sum_k rgb_k exp(exp(l_k) (d . mu_k - 1)), mu_k a unit vector.
 
-    Args:
-        base: [N, 3].
-        lobes: [N, K, 7], columns mu (3, any length), l = log sharpness, r, g, b.
-        dirs: [N, 3] unit view directions, world frame, from the camera to the surfel.
-
-    Returns:
-        [N, 3].
+    `base`: [N, 3]; `lobes`: [N, K, 7], columns mu (3, any length), l = log sharpness, r, g, b.
     """
     cosine = (unit(lobes[..., :3]) * dirs[:, None]).sum(-1)  # [N, K]
     falloff = torch.exp(lobes[..., 3].exp() * (cosine - 1))
@@ -108,20 +91,15 @@ def sg(base: Tensor, lobes: Tensor, dirs: Tensor) -> Tensor:
 
 
 def reduced(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) -> Tensor:
-    """Evaluate reduced view colours, with a varying number of terms per surfel; without terms the base colour.
+    """Evaluate reduced view colours, with a varying number of terms per surfel.
 
     sv: (base + sum_k exp(b_k . d) rgb_k) / (1 + sum_k exp(b_k . d)), a term is b, rgb: Spherical Voronoi relative to
     its first site. sh: base is dc, terms are the coefficients from degree 1 on. sb, sg: base plus lobes.
 
     Args:
-        kind: a name of `ops.VIEW_COLORS`.
         base: [N, 3].
         span: [N, 2] first term and number of terms.
         terms: [T, 6] (sv, sb), [T, 3] (sh) or [T, 7] (sg).
-        dirs: [N, 3] unit view directions, world frame, from the camera to the surfel.
-
-    Returns:
-        [N, 3].
     """
     out = []
     for color, (first, count), d in zip(base, span.tolist(), dirs, strict=True):
@@ -135,5 +113,5 @@ def reduced(kind: str, base: Tensor, span: Tensor, terms: Tensor, dirs: Tensor) 
 
 
 def view_directions(means: Tensor, viewmat: Tensor) -> Tensor:
-    """Compute unit vectors [N, 3] from the camera to the surfels' centres, world frame; differentiable in `means`."""
+    """Compute `dirs` from the surfels' centres [N, 3] and a camera [4, 4]; differentiable."""
     return unit(means + viewmat[:3, :3].T @ viewmat[:3, 3])

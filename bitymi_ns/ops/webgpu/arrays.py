@@ -22,7 +22,7 @@ KINDS = {name: number for number, name in enumerate(FORMS)}
 
 
 def _struct(name: str) -> np.dtype:
-    """Read the memory layout of a struct of scene.wgsl, by WGSL's rules of alignment."""
+    """Read the layout of a struct of scene.wgsl, by WGSL's rules of alignment."""
     text = (resources.files("bitymi_ns.ops") / "shaders" / "scene.wgsl").read_text("utf8")
     body = text.split(f"struct {name} {{")[1].split("\n}")[0]
     offsets, formats, end = {}, [], 0
@@ -34,14 +34,8 @@ def _struct(name: str) -> np.dtype:
         offsets[field] = -(-end // alignment) * alignment
         formats.append(np.dtype((f"<{kind}4", (int(rows), width) if array else width if vector else ())))
         end = offsets[field] + formats[-1].itemsize
-    return np.dtype(
-        {
-            "names": list(offsets),
-            "formats": formats,
-            "offsets": list(offsets.values()),
-            "itemsize": -(-end // 16) * 16,
-        }
-    )
+    placed = {"names": list(offsets), "formats": formats, "offsets": list(offsets.values())}
+    return np.dtype({**placed, "itemsize": -(-end // 16) * 16})
 
 
 SURFEL, SEEN, FRAME = _struct("Surfel"), _struct("Seen"), _struct("Frame")
@@ -60,8 +54,8 @@ class Arrays:
 
 
 def arrays(scene: BakedSceneLike) -> Arrays:
-    """Convert a scene. Raises TypeError: the surfels are not float32. Raises ValueError: a view-colour parameter has a
-    wrong shape, or a tile lies outside its page."""
+    """Convert a scene. Raises TypeError: not float32. Raises ValueError: a view-colour parameter has a wrong shape, or
+    a tile lies outside its page."""
     p = {name: value.detach().cpu() for name, value in scene.surfels.items()}
     for name, value in p.items():
         if value.dtype != torch.float32 and name != "view_span":

@@ -31,8 +31,8 @@ def library() -> ModuleType:
 
 @functools.cache
 def device() -> Any:
-    """Return the device of this process, a GPU if possible, else a software adapter, with the available `OPTIONAL`.
-    Raises WebGpuUnavailable: none found; says what to do."""
+    """Return the device of this process, a GPU if possible, else a software adapter. Raises WebGpuUnavailable: none
+    found."""
     rank = {"DiscreteGPU": 0, "IntegratedGPU": 1, "VirtualGPU": 2, "Unknown": 3, "CPU": 4}
     adapters = [a for a in library().gpu.enumerate_adapters_sync() if a.info["backend_type"] != "OpenGL"]
     if not adapters:
@@ -50,17 +50,9 @@ def device() -> Any:
         raise WebGpuUnavailable(f"the graphics device {adapter.info['device']} cannot be used: {error}") from error
 
 
-def check_room(array_bytes: int, groups: int, size: tuple[int, int], layers: int = 1) -> None:
-    """Check resources against the device's limits before creating them.
-
-    Args:
-        array_bytes: of the largest buffer.
-        groups: largest number of workgroups in a dispatch.
-        size: width and height of a texture.
-
-    Raises:
-        WebGpuUnavailable: a limit is exceeded; says which.
-    """
+def check_room(*, array_bytes: int = 0, groups: int = 0, size: tuple[int, int] = (0, 0), layers: int = 0) -> None:
+    """Check bytes of the largest buffer, workgroups of a dispatch, and the size of a texture against the device's
+    limits. Raises WebGpuUnavailable: one is exceeded."""
     limits = device().limits
     wanted = {
         "max-storage-buffer-binding-size": array_bytes,

@@ -35,9 +35,9 @@ _STRIDE = 256  # offset alignment of the uniforms of batches and rounds
 
 @functools.cache
 def programs() -> Programs:
-    """Compile the programs for the device of this process."""
+    """The programs, for the most precise target that the device can blend."""
     format = "rgba32float" if "float32-blendable" in device().features else "rgba16float"
-    return Programs(device(), format)
+    return Programs(format)
 
 
 @dataclass
@@ -52,22 +52,15 @@ class _Target:
 
 
 class SceneOnDevice:
-    """A scene as textures and buffers of the WebGPU device.
-
-    Args:
-        scene: the scene, copied.
-
-    Raises:
-        WebGpuUnavailable: no device, or the scene exceeds its limits.
-        TypeError, ValueError: as `arrays`.
-    """
+    """A scene, copied to textures and buffers of the WebGPU device. Raises WebGpuUnavailable: no device, or the scene
+    exceeds its limits. Raises TypeError, ValueError: as `arrays`."""
 
     def __init__(self, scene: BakedSceneLike) -> None:
         self._programs, self._device = programs(), device()
         packed = arrays(scene)
         self._origin, self._kind = packed.origin, packed.kind
         self.count = len(packed.surfels)
-        check_room(max(packed.surfels.nbytes, packed.terms.nbytes), -(-self.count // 64), (1, 1))
+        check_room(array_bytes=max(packed.surfels.nbytes, packed.terms.nbytes), groups=-(-self.count // 64))
         self._near, self._bound = scene.near, scene.weight_bound
         self._offset, self._scale, self._alpha_scale = scene.offset, scene.scale, scene.alpha_scale
         flags = library().BufferUsage
@@ -111,7 +104,7 @@ class SceneOnDevice:
                     stacklevel=2,
                 )
         if texels is None:
-            return self._pages("rgba8unorm", np.zeros((1, 1, 1, 4), np.uint8), 1)
+            texels = torch.zeros(1, 1, 1, 4, dtype=torch.uint8)
         if texels.dtype == torch.uint8:
             return self._pages("rgba8unorm", texels.cpu().numpy(), 1)
         if "float32-filterable" in features:
@@ -122,7 +115,7 @@ class SceneOnDevice:
         """Create an array texture from pages [layers, rows of blocks, blocks, ...]."""
         layers, rows, columns = pages.shape[:3]
         size = (columns * block, rows * block, layers)
-        check_room(0, 0, size[:2], layers)
+        check_room(size=size[:2], layers=layers)
         flags = library().TextureUsage
         texture = self._device.create_texture(
             size=size, format=format, usage=flags.TEXTURE_BINDING | flags.COPY_DST, dimension="2d"
@@ -181,8 +174,7 @@ class SceneOnDevice:
 
     def _make_coarser(self) -> None:
         """Make the levels 1 and 2 of all pages, for the first view smaller than the photographs."""
-        formats = {"rgba16float": "rgba16float", "rgba32float": "rgba32float"}
-        format = formats.get(self._atlas.format, "rgba8unorm")
+        format = "rgba8unorm" if self._atlas.format == "bc7-rgba-unorm" else self._atlas.format
         width, height, layers = self._atlas.size
         flags = library().TextureUsage
         size = (max(1, width // 2), max(1, height // 2), layers)
@@ -220,7 +212,7 @@ class SceneOnDevice:
         if self._target is None or self._target.size != (width, height):
             flags, buffers, p = library().TextureUsage, library().BufferUsage, self._programs
             size, texel = (width, height, 1), 16 if p.format == "rgba32float" else 8
-            check_room(0, 0, (width, height))
+            check_room(size=(width, height))
             sums = self._device.create_texture(
                 size=size, format=p.format, usage=flags.RENDER_ATTACHMENT | flags.COPY_SRC
             )
@@ -248,16 +240,8 @@ class SceneOnDevice:
         self._device.queue.write_buffer(self._frame, 0, frame)
 
     def draw(self, camera: CameraLike, show: str, layers: int, photo_pixel: float = 1.0) -> npt.NDArray[np.float32]:
-        """Draw a view.
-
-        Args:
-            show: a name of `SHOW`.
-            layers: batches, at most `MOST_LAYERS`.
-            photo_pixel: side of a photograph's pixel in pixels of the view.
-
-        Returns:
-            [H, W, 4]: sums, and remaining transmittance.
-        """
+        """Draw a view in `layers` batches, at most `MOST_LAYERS`: [H, W, 4], the sums of `show` (a name of `SHOW`), and
+        the remaining transmittance. `photo_pixel`: side of a photograph's pixel in pixels of the view."""
         target = self._target_of(camera.width, camera.height)
         if photo_pixel < 1.0 and self._coarser is None:
             self._make_coarser()
@@ -298,13 +282,8 @@ class SceneOnDevice:
         for k in range(layers):
             if k:
                 encoder.copy_texture_to_texture({"texture": sums}, {"texture": copy}, (*target.size, 1))
-            attachment = {
-                "view": view,
-                "load_op": "load" if k else "clear",
-                "store_op": "store",
-                "clear_value": (0, 0, 0, 1),
-            }
-            work = encoder.begin_render_pass(color_attachments=[attachment])
+            attachment = {"view": view, "load_op": "load" if k else "clear", "store_op": "store"}
+            work = encoder.begin_render_pass(color_attachments=[{**attachment, "clear_value": (0, 0, 0, 1)}])
             work.set_pipeline(pipeline)
             work.set_bind_group(0, self._drawn)
             work.set_bind_group(1, self._pages_bound)
@@ -332,13 +311,11 @@ def draw(
     photo_pixel: float = 1.0,
     layers: int = LAYERS,
 ) -> dict[str, Tensor]:
-    """Draw views one by one to the CPU; see `baked.draw`. Raises WebGpuUnavailable: the package wgpu or a graphics
+    """Draw views one by one to the CPU, as `baked.draw`. Raises WebGpuUnavailable: the package wgpu or a graphics
     device is missing."""
     texels = (scene.tiles, scene.atlas, scene.blocks, scene.extent, scene.mean_residual, scene.mean_alpha)
-    sources = (*scene.surfels.values(), *texels)
-    scales = f"{scene.offset} {scene.scale} {scene.alpha_scale}"
-    numbers = f"webgpu {scene.near} {scene.weight_bound} {scales}"
-    there = scene.cache.atlas(lambda: SceneOnDevice(scene), *sources, numbers)
+    numbers = f"webgpu {scene.near} {scene.weight_bound} {scene.offset} {scene.scale} {scene.alpha_scale}"
+    there = scene.cache.atlas(lambda: SceneOnDevice(scene), *scene.surfels.values(), *texels, numbers)
     drawn: dict[str, list[Tensor]] = {name: [] for name in images}
     for camera in cameras:
         sums = {

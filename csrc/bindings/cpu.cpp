@@ -28,12 +28,10 @@ void prepare(void* at, size_t bytes) {
 
 const Device kHost = {nb::device::cpu::value, "the CPU", false, prepare};
 
-// Process-wide settings for fast kernels. Not made on import, so that reading a constant does not change threads and
-// memory.
+// Process-wide settings for fast kernels; not on import, so that reading a constant changes neither threads nor memory.
 void set_up_process() {
 #if defined(__GLIBC__)
-  // Every view allocates and frees tens of megabytes; unmapping them each time costs more in page faults than computing
-  // in them.
+  // Every view allocates and frees tens of megabytes; unmapping them costs more in page faults than computing in them.
   if (!std::getenv("MALLOC_TRIM_THRESHOLD_")) {
     mallopt(M_MMAP_THRESHOLD, kFromSystem);
     mallopt(M_TRIM_THRESHOLD, 1 << 30);

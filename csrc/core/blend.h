@@ -46,8 +46,8 @@ template <class T> BT_HD Blend<T> blend(T sigma, T transmittance) {
 // Multiplies sigma by a texel's alpha m and clamps it, see AlphaTiles.
 template <class T> BT_HD T alpha_cut(T sigma, T m) { return min_(T(kAlphaMax), sigma * m); }
 
-// The open pixels that take the fragment, and those it ends, because it would leave less transmittance than `stop`. A
-// fragment that would leave less than kTransmittanceMin is not blended, unless `stop` is smaller.
+// The open pixels that take the fragment, and those it ends, as it would leave less transmittance than `stop`. One that
+// would leave less than kTransmittanceMin is not blended, unless `stop` is smaller.
 template <class T> struct BlendTest {
   MaskOf<T> takes, ends;
 };
@@ -66,8 +66,7 @@ template <class S> BT_HD S blend_vjp(S weight, S sigma, S dweight, S& later) {
   return dsigma;
 }
 
-// Adds a fragment to the sums of its pixel; depth and normal only with maps. By reference, so that numbers are loaded
-// where they are used.
+// Adds a fragment to the sums of its pixel. By reference, so that numbers are loaded where they are used.
 template <bool kMaps, class S>
 BT_HD void add_blended(S weight, const S* color, const S& beta, const S& depth, const S* normal, S* sums) {
   sums[0] += weight * color[0], sums[1] += weight * color[1], sums[2] += weight * color[2];

@@ -2,23 +2,21 @@
 // Hanson et al. 2025) for the level set of the Beta kernel, united with the low pass. In the offset (dx, dy) from the
 // projected centre the level set u^2 + v^2 <= r_c^2 is the conic U^2 + V^2 <= r_c^2 W^2.
 //
-// Always evaluated in double, from the (rounded) coefficients of the fragments: the determinant of a conic with axis
-// ratio k loses a factor k^2, and a bound that misses a pixel leaves a hole. Used on the CPU; footprint.h serves GPUs,
-// where doubles are slow.
+// Evaluated in double, from the (rounded) coefficients of the fragments: the determinant of a conic with axis ratio k
+// loses a factor k^2, and a bound that misses a pixel leaves a hole. Used on the CPU; footprint.h serves GPUs.
 #pragma once
 
 #include "core/surfel.h"
 
 namespace bt {
 
-// The first part is shared with footprint.h: level set, padding, culling of discs out of view, and x offsets of box,
-// ellipse and low pass between two lines.
+// The first part is shared with footprint.h.
 
 // sigma >= 1/255  <=>  u^2 + v^2 <= r_c^2 with r_c^2 = 9 (1 - (255 o)^(-1/beta)), or d^2 <= ln(255 o).
 // Returns an opacity relative to the smallest drawn sigma.
 template <class S> BT_HD S times_drawn(S opacity) { return S(1 / kAlphaMin) * opacity; }
-// Computes the squared radius r_c^2 = 9 (1 - exp(-level / beta)) where the kernel is exp(-level) of its maximum;
-// enlarged by a part in 5,000 and `slack`, so that the bound holds despite rounding.
+// Computes the squared radius r_c^2 = 9 (1 - exp(-level / beta)) where the kernel is exp(-level) of its maximum,
+// enlarged by a part in 5,000 and `slack` against rounding.
 template <class S> BT_HD S level_radius2(S level, S beta, S slack) {
   const S x = S(1) - exp_(-level / max_(beta, S(1e-6)));
   return S(kSupport2) * min_(S(1), x * S(1.0002) + slack);
@@ -50,8 +48,8 @@ template <class T> struct Interval {
   }
 };
 
-// Image of a level set: the ellipse's box and outermost points, and the low pass's disc. Offsets from the projected
-// centre in pixels.
+// Image of a level set: the ellipse's box and outermost points, and the low pass's disc; pixels from the projected
+// centre.
 template <class T> struct Outline {
   MaskOf<T> whole = T(0.0f) < T(0.0f);             // the disc comes near the camera plane: covers the screen
   MaskOf<T> ellipse = T(0.0f) < T(0.0f);           // false: low pass only
@@ -84,10 +82,10 @@ template <class T> BT_HD DiscImage<T> disc_image(const T* g, T r2) {
           angle};
 }
 
-// Returns true where the part of a disc in front of the camera lies beyond a border of the image: the disc against the
-// plane through the camera and the border. `border`: offset of the border's line from the projected centre, between the
-// centre and the image; 0: the centre is not beyond it. If X.q < border (1 + C.q) on the whole disc, or >, no ray of
-// the image meets it, even where it crosses the camera's plane and has no box. False for NaN.
+// Returns true where the part of a disc in front of the camera lies beyond a border of the image. `border`: offset of
+// the border's line from the projected centre, between the centre and the image; 0: the centre is not beyond it. If
+// X.q < border (1 + C.q) on the whole disc, or >, no ray of the image meets it, even where it has no box. False for
+// NaN.
 template <class T> BT_HD MaskOf<T> beyond_border(T xu, T xv, T cu, T cv, T border) {
   const T u = xu - border * cu, v = xv - border * cv, far = abs_(border);
   const T room = far - T(1e-5) * (abs_(xu) + abs_(xv) + far * (abs_(cu) + abs_(cv)));  // less the rounding error
@@ -130,7 +128,7 @@ template <class T> struct ExtentOf : Outline<T> {
   // qa x^2 + 2 qb x y + qc y^2 + 2 qd x + 2 qe y + qf <= 0
 };
 using Extent = ExtentOf<double>;
-// Calls fn(member of a, member of b) for all numeric members of two extents.
+// Calls fn(member of a, member of b) for all numbers of two extents.
 template <class A, class B, class F> BT_HD void each_number(A& a, B& b, F&& fn) {
   fn(a.x0, b.x0), fn(a.x1, b.x1), fn(a.y0, b.y0), fn(a.y1, b.y1);
   fn(a.y_left, b.y_left), fn(a.y_right, b.y_right), fn(a.blur, b.blur);
@@ -141,7 +139,7 @@ template <class T> BT_HD void find_outermost(ExtentOf<T>& e) {
   e.y_left = -(e.qb * e.x0 + e.qe) / e.qc, e.y_right = -(e.qb * e.x1 + e.qe) / e.qc;
 }
 
-// Level set of a row. `room`: margin of its logarithm, 0 for doubles.
+// `room`: margin of the logarithm, 0 for doubles.
 constexpr double kFloatRoom = 1e-5;
 template <class T> struct Level {
   MaskOf<T> visible;
@@ -159,7 +157,7 @@ template <class Kernel, class T> BT_HD Level<T> level_of(const T* g, double shar
     l.blur = select(blurred >= almost, low_pass_radius(log_(max_(blurred, one)) + T(room)) / T(sqrt_(sharp)), T(0.0f));
   return l;
 }
-// Computes its conic and bounding box, in doubles, for an image of that size.
+// Computes its conic and bounding box for an image of that size.
 template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int width, int height) {
   const T zero = T(0.0f);
   const T u1 = g[kU1], u2 = g[kU2], v1 = g[kV1], v2 = g[kV2], w0 = g[kW0], w1 = g[kW1], w2 = g[kW2];
@@ -189,7 +187,7 @@ template <class T> BT_HD ExtentOf<T> conic_extent(const T* g, T rc2, T blur, int
   return e;
 }
 
-// Level set and conic (in doubles) of rows, without the outermost points.
+// Level set and conic of rows, without the outermost points.
 template <class T> struct LevelExtent {
   Level<T> level;
   ExtentOf<Widened<T>> conic;

@@ -76,7 +76,7 @@ template <class S> BT_HD Vec3<S> cross(Vec3<S> a, Vec3<S> b) {
 template <class S> BT_HD Vec3<S> load3(const S* p) { return {p[0], p[1], p[2]}; }
 template <class S> BT_HD void store3(S* p, Vec3<S> a) { p[0] = a.x, p[1] = a.y, p[2] = a.z; }
 
-// Normalises a; vectors shorter than the floor are divided by it.
+// Normalises a vector; those shorter than the floor are divided by it.
 template <class S> struct Unit {
   Vec3<S> n;
   S inv;           // 1 / max(|a|, floor)

@@ -81,8 +81,8 @@ template <class S> BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S h
   return k * (tangential * (dc - along * n) + (radial * along) * n);
 }
 
-// Corners of a level's cell: entries of the hash table and trilinear weights. Bits of the corner's index: x, y, z. The
-// hash is XOR of coordinate times prime, with the standard primes.
+// Corners of a level's cell: entries of the hash table, XOR of coordinate times prime, and trilinear weights. Bits of
+// the corner's index: x, y, z.
 template <class T> struct Corners {
   typename IndexOf<T>::type index[8];
   T weight[8];
@@ -117,8 +117,8 @@ template <class S> BT_HD Vec3<S> cell_gradient(S fx, S fy, S fz, S resolution, c
               (gx * gy * (d[4] - d[0]) + fx * gy * (d[5] - d[1]) + gx * fy * (d[6] - d[2]) + fx * fy * (d[7] - d[3]))};
 }
 
-// MLP on rows of kWidth values. `Row` is kWidth lanes; weights are stored input-major, w3 output-major (three rows),
-// and transposed for the backward pass. With fewer levels than kMaxLevels the unused inputs and rows of w1 are 0.
+// MLP on rows of kWidth values, one lane each; weights are stored input-major, w3 output-major (three rows), and
+// transposed for the backward pass. With fewer levels than kMaxLevels the unused inputs and rows of w1 are 0.
 constexpr int kInputs = kMaxLevels * kFeatures;
 static_assert(kInputs == kWidth, "features and hidden layers share one type of row");
 template <class S, class Row> struct Mlp {

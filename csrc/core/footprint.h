@@ -1,7 +1,6 @@
 // Bounds of the pixels that a surfel can touch, like bounds.h, but in the reals of the fragments, for devices with slow
-// doubles; the tiles, and their parts of 8 x 4 pixels. The image of the level set's disc replaces the conic: the box
-// and crossings with a line follow from sums of squares, without a determinant of squared coefficients, so that thin
-// surfels lose no precision.
+// doubles. The image of the level set's disc replaces the conic: the box and crossings with a line follow from sums of
+// squares, without a determinant of squared coefficients, so that thin surfels lose no precision.
 #pragma once
 
 #include "core/bounds.h"
@@ -16,7 +15,7 @@ template <class S> struct LevelSet {
   S blur2;  // 0: the low pass nowhere exceeds the kernel
 };
 
-// Computes that of a row; with ResizedKernel the low pass has the squared radius 1 / sharp and height kLowPassHeight.
+// With ResizedKernel the low pass has the squared radius 1 / sharp and height kLowPassHeight.
 template <class Kernel, class S> BT_HD LevelSet<S> level_set(const S* g, S near, S sharp) {
   LevelSet<S> l = {false, S(0), S(0)};
   const S ratio = times_drawn(g[kOpacity]), almost = S(1) - S(1e-6);
@@ -179,8 +178,7 @@ BT_HD uint32_t part_mask(const TileRow& r, int tx) {
   }
   return mask;
 }
-// Computes the part mask of a disc without a box that crosses the camera's plane: parts that its level set or low pass
-// reaches.
+// Computes the part mask of a disc without a box that crosses the camera's plane.
 template <class S> BT_HD uint32_t reached_parts(const S* row, int tx, int ty) {
   constexpr S kPartWidth = kTile / 2;
   const S x = tx * kTile - row[kCx], y = ty * kTile - row[kCy];

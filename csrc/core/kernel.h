@@ -40,8 +40,7 @@ template <class T> BT_HD MaskOf<T> within_in_front(const Planes<T>& p, T r2) {
 // Returns true where the kernel is above 0, in front of the camera or behind it.
 template <class T> BT_HD MaskOf<T> in_support(const Planes<T>& p) { return within(p, T(kSupport2)); }
 
-// Returns the largest distance of a pixel from the middle of its cell, with the rounding error for offsets up to
-// `largest`.
+// Largest distance of a pixel from the middle of its cell, with the rounding error for offsets up to `largest`.
 template <class S> BT_HD S cell_half(S half, S centre, S largest) { return half + S(1e-6) * (largest + abs_(centre)); }
 // Masks of cells with a pixel in the kernel's level set u^2 + v^2 < r2, and in that of the low pass, d^2 < blur2. x, y:
 // offset of the cell's middle from the projected centre. Conservative, with few false positives: within a cell a plane
@@ -87,7 +86,7 @@ template <bool kMisses = true, class S, class T> BT_HD Hit<T> hit(const S* g, S 
 }
 
 // Evaluates a surfel at a pixel. Without kBlur the low pass is left out, for pixels not near the centre; where sigma is
-// 0 the rest is then undefined. `sharp` here and below: 1 / squared radius of the low pass, used by ResizedKernel only.
+// 0 the rest is then undefined. `sharp` here and below: of ResizedKernel, 1 / squared radius of the low pass.
 template <class Kernel, bool kBlur = true, class S, class T>
 BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   const T zero = T(S(0)), one = T(S(1));
@@ -134,9 +133,8 @@ template <class T> BT_HD T listed_sigma(const Fragment<T>& f) {
   return select(f.low_pass > T(0.0f), -f.sigma, f.sigma);
 }
 
-// Adds the gradients of a row of geom to d[kGeom], from those of a fragment with sigma `listed`; ddx, ddy is the
-// gradient with respect to the pixel's offset. `rim` bounds 1 - x from below in the kernel's derivative, which diverges
-// at the rim for beta < 1.
+// Adds the gradients of a row of geom to d[kGeom], from those of a fragment with sigma `listed`; ddx, ddy: with respect
+// to the pixel's offset. `rim` bounds 1 - x from below in the kernel's derivative, which diverges at 0 for beta < 1.
 template <class S, class T>
 BT_HD void fragment_vjp(const S* g, S near, S rim, T dx, T dy, T listed, T dsigma, T du, T dv, T ddepth, T* d, T& ddx,
                         T& ddy) {

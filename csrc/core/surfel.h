@@ -33,8 +33,7 @@ template <class S, class T> BT_HD Vec3<T> rotate(const S* R, Vec3<T> a) {
   return {T(R[0]) * a.x + T(R[1]) * a.y + T(R[2]) * a.z, T(R[3]) * a.x + T(R[4]) * a.y + T(R[5]) * a.z,
           T(R[6]) * a.x + T(R[7]) * a.y + T(R[8]) * a.z};
 }
-// Transforms a world point to the camera, in double: far from the origin R m and t cancel, which in float32 would leave
-// only rounding errors.
+// Transforms a world point to the camera, in double: far from the origin R m and t cancel.
 template <class S, class T> BT_HD Vec3<T> to_camera(const Pinhole<S>& cam, Vec3<T> m) {
   using D = Widened<T>;
   const D x = widened(m.x), y = widened(m.y), z = widened(m.z);
@@ -73,8 +72,8 @@ constexpr GeomColumn kLowPassHeight = GeomColumn(kGeom - 1);
 // Columns of a row of `frames` [N, kFrame]: mean, s_u t_u, s_v t_v, all in the world frame.
 constexpr int kFrame = 9;
 
-// Kernels, chosen at compile time by with_kernel. LowPassKernel: the maximum of the Beta kernel and the low pass
-// (core/kernel.h). ResizedKernel: the same in a view of another size than the photographs, for the baked renderers.
+// Kernels, chosen by with_kernel. LowPassKernel: the maximum of the Beta kernel and the low pass (core/kernel.h).
+// ResizedKernel: the same in a view of another size than the photographs, for the baked renderers.
 struct LowPassKernel {
   static constexpr bool kResized = false;
 };
@@ -92,8 +91,7 @@ template <class S, class T> BT_HD T slope(const S* g, GeomColumn first, T dx, T 
   return T(g[first]) * dx + T(g[first + 1]) * dy;
 }
 
-// Parameters of a surfel's geometry and their numbers, as `ops.parameters.GEOMETRY_PARAMETERS` in Python. Structs,
-// loads, checks and arguments follow from it.
+// Parameters of a surfel's geometry and their numbers, as `ops.parameters.GEOMETRY_PARAMETERS` in Python.
 #define BT_GEOMETRY(each) each(means, 3) each(quats, 4) each(log_scales, 2) each(opacity_logits, 1) each(beta_raw, 1)
 
 // Geometry of n surfels.
@@ -203,7 +201,7 @@ template <class S, class T> BT_HD WorldSurfel<T> world_surfel(const Pinhole<S>& 
   return {rotation(in.quats), surfel_scale(in.log_scales[0]), surfel_scale(in.log_scales[1]),
           to_camera(cam, load3(in.means))};
 }
-// A surfel in the camera frame: tangents, normal, n.p with its sign, and the reciprocals of p.z, fx, fy and scales.
+// A surfel in the camera frame.
 template <class S, class T> struct CameraSurfel {
   Vec3<T> a, b, n;
   T np, sign, iz, isu, isv;
@@ -220,8 +218,7 @@ template <class S, class T> BT_HD CameraSurfel<S, T> camera_surfel(const Pinhole
   return s;
 }
 
-// Fills a row of geom and of frames; false, with undefined rows, if the surfel is not finite or its centre is nearer
-// than `near` (camera z).
+// Fills a row of geom and of frames; false, with undefined rows, if not finite or the centre is nearer than `near`.
 template <class S, class T>
 BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T* g, T* frame) {
   const WorldSurfel<T> at = world_surfel(cam, in);
@@ -246,8 +243,8 @@ BT_HD MaskOf<T> project(const Pinhole<S>& cam, const SurfelRow<T>& in, S near, T
   return ok;
 }
 
-// Writes the gradients of the parameters of surfel i from those of its rows; 0 if the surfel is not visible. dframe may
-// be null (zero). The slope of a sigmoid is sigmoid(x) sigmoid(-x), as 1 - o vanishes in float32 for o -> 1.
+// Writes the gradients of the parameters of surfel i from those of its rows; 0 if not visible. dframe may be null
+// (zero). The slope of a sigmoid is sigmoid(x) sigmoid(-x), as 1 - o vanishes in float32 for o -> 1.
 template <class S>
 BT_HD void project_vjp(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, const S* geom, const S* dgeom,
                        const S* dframe, const SurfelGradients<S>& out) {

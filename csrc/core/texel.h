@@ -26,9 +26,9 @@ constexpr int kTileLevels = 3;
 BT_HD bool has_level(const int32_t* tile, int level) {  // x, y, page, r_u, r_v
   return ((tile[0] | tile[1] | tile[3] | tile[4]) & ((1 << level) - 1)) == 0;
 }
-// Mip level with about one texel per pixel, by area, from a row g of geom (core/surfel.h). Halved at most as often as
-// the view relative to the photographs, at whose size texels were trained. kTileLevels: at most 2 texels a side would
-// be left, and the tile's mean replaces them.
+// Mip level with about one texel per pixel, by area, from a row g of geom. Halved at most as often as the view relative
+// to the photographs, at whose size texels were trained. kTileLevels: at most 2 texels a side would be left, and the
+// tile's mean replaces them.
 template <class S> BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, S photo_pixel) {
   const S k = S(0.5) / (extent * g[kW0]);  // texels per pixel along the gradient of u and v, squared
   const S u = g[kU1] * g[kU1] + g[kU2] * g[kU2], v = g[kV1] * g[kV1] + g[kV2] * g[kV2];
@@ -40,9 +40,8 @@ template <class S> BT_HD int tile_level(const S* g, int r_u, int r_v, S extent, 
   return level && side <= 2 ? kTileLevels : min_(level, kTileLevels - 1);
 }
 
-// Texels on both sides of a position along one axis: `first`, a whole number, and the next, with weight `fraction`. A
-// tile of one texel has no next: `first` replaces it. Not `inside`: beyond the outer texel centres, where the position
-// is clamped.
+// Texels on both sides of a position along one axis: `first`, and the next, with weight `fraction`, which is `first`
+// again in a tile of one texel. Not `inside`: beyond the outer texel centres, where the position is clamped.
 template <class T> struct TexelAxis {
   T first, fraction;
   MaskOf<T> inside;
@@ -81,7 +80,7 @@ template <class V, class S> BT_HD V texel_slope_v(const V* t, S fx) {
 // Returns the texels per unit of u.
 template <class S> BT_HD S texel_density(int r, S extent) { return S(r) / (S(2) * extent); }
 
-// Texels of one fetch, as offsets from the tile's first, and their weights.
+// Texels of one fetch, as offsets from the tile's first.
 template <class S> struct TexelCorners {
   int32_t at[4];
   S weight[4];
@@ -132,8 +131,8 @@ template <class S, int C> struct TilePatch {
 template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
 }
-// Slopes of the fetch along u and v, from its four texels: 0 beyond the outer texel centres; at an inner centre, where
-// the slope jumps, that on the side of larger coordinates.
+// Slopes of the fetch along u and v: 0 beyond the outer texel centres; at an inner centre, where the slope jumps, that
+// on the side of larger coordinates.
 template <class S> struct TexelSlopes {
   Vec3<S> u, v;
 };

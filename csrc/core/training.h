@@ -54,8 +54,8 @@ template <class S> BT_HD void add_moments(S k, S a, S b, S* means) {
   means[0] += ka, means[1] += kb, means[2] += ka * a, means[3] += kb * b, means[4] += ka * b;
 }
 
-// Computes SSIM from weighted means over a window of a, b, a^2, b^2 and a b. d: derivatives with respect to the means
-// of a, a^2 and a b; a pixel p of weight k gets k (d[0] + 2 a_p d[1] + b_p d[2]).
+// Computes SSIM from the means of a window. d: derivatives with respect to the means of a, a^2 and a b; a pixel p of
+// weight k gets k (d[0] + 2 a_p d[1] + b_p d[2]).
 template <class S> BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
   const S c1 = S(kSsimC1), c2 = S(kSsimC2), one = S(1.0f), two = S(2.0f);
   const S p = two * a * b + c1, q = two * (ab - a * b) + c2;

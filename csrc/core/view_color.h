@@ -6,8 +6,7 @@
 
 namespace bt {
 
-// Computes the vector from the camera's centre in double: far from the origin, rounding the centre to float32 would
-// turn the direction.
+// Computes the vector from the camera's centre in double: far from the origin, a rounded centre would turn it.
 template <class S> BT_HD Vec3<S> from_center(const S* mean, const double* center) {
   return {S(double(mean[0]) - center[0]), S(double(mean[1]) - center[1]), S(double(mean[2]) - center[2])};
 }

@@ -31,8 +31,7 @@ template <class S> struct ViewColorRow {
 
 // Members of a kind's struct: name, fewest terms, and the preset's number of terms, for which kernels with unrolled
 // loops are compiled; parameter widths; the colour, and its vector-Jacobian product, which writes the gradients of the
-// parameters and adds to that of d; and the reduced form: terms of kReducedWidth numbers, and the colour of a base and
-// K terms.
+// parameters and adds to that of d; the reduced colour of a base and K terms of kReducedWidth numbers.
 
 // Spherical Voronoi. a = sites [K, 3], b = log tau [K], c = rgb [K, 3].
 struct SphericalVoronoi {
@@ -73,8 +72,8 @@ struct SphericalVoronoi {
     }
     return (S(1) / total) * c;
   }
-  // dlogit_k = w_k dc . (rgb_k - c) is computed with all colours relative to that of the heaviest site: if one site has
-  // nearly all weight, its rgb_k - c is then a sum of small terms, not a difference of equal colours, whose rounding a
+  // dlogit_k = w_k dc . (rgb_k - c) is computed with colours relative to that of the heaviest site: if it has nearly
+  // all weight, its rgb_k - c is then a sum of small terms, not a difference of equal colours, whose rounding a
   // temperature of 1e4 would amplify.
   template <class S>
   BT_HD static void color_vjp(int K, ViewColorRow<const S> p, Vec3<S> d, Vec3<S> dc, ViewColorRow<S> dp, Vec3<S>& dd) {

@@ -27,8 +27,7 @@ BT_HD void find_seen(MaskOf<T> visible, const E& extent, int width, int height, 
   s.radii[0] = min_(most, max_(x1, -x0)), s.radii[1] = min_(most, max_(y1, -y0));
 }
 
-// Writes the rows of surfel i, 0 if it is not visible. Returns false if a parameter is not finite. mark(sight): calls
-// find_seen.
+// Writes the rows of surfel i, 0 if not visible. Returns false if a parameter is not finite. mark(sight): find_seen.
 template <class Kernel, class S, class Mark>
 BT_HD bool project_visible(const Pinhole<S>& cam, const Surfels<S>& in, int64_t i, S near, const Resize<S>& to, S* geom,
                            S* frames, S* radii, Mark&& mark) {

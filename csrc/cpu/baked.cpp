@@ -109,8 +109,8 @@ inline TexelPairs<float, channels> pairs_along_v(const float* patch, const int32
 }
 #endif
 
-// Interpolates stored values bilinearly at the lanes' positions in a tile. Positions are clamped to the outer texel
-// centres; in a tile's last column and row the neighbour has weight 0 and may be any texel.
+// Interpolates stored values bilinearly at the lanes' positions in a tile, clamped to the outer texel centres; in the
+// last column and row the neighbour has weight 0 and may be any texel.
 template <class S, int channels, class T>
 inline Texels<S, channels> bilinear(const T* patch, int columns, Lanes<S> x, Lanes<S> y) {
   using P = Lanes<S>;
@@ -167,7 +167,7 @@ void gather_patches(const Pages& a, Patches& out) {
 }
 
 namespace {
-// Parameters of a surfel besides its row of geom, contiguous, as every tile it touches reads them.
+// A surfel besides its row of geom, contiguous, as every tile it touches reads it.
 template <class S> struct DrawnSurfel {
   S view[3];             // colour without residual
   S bound;               // fragments of smaller weight get no residual

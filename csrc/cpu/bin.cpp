@@ -10,8 +10,7 @@
 namespace bt {
 
 namespace {
-// Returns the tile that contains the box of a surfel, the common case of small ones, whose rows are not intersected.
-// -1: several tiles.
+// Returns the tile that contains the box of a surfel, whose rows are then not intersected; -1: several tiles.
 template <class S> int only_tile(const S* g, const S* radii, const Bins& bins) {
   const S x = g[kCx] - S(0.5), y = g[kCy] - S(0.5), side = S(kTile);
   const S column = floor_((x - radii[0]) / side), row = floor_((y - radii[1]) / side);
@@ -20,8 +19,7 @@ template <class S> int only_tile(const S* g, const S* radii, const Bins& bins) {
   return int(row) * bins.tiles_x + int(column);
 }
 
-// Arguments of `reached` (core/kernel.h) for a row: r_c^2, and the squared radius of the low pass, 0
-// if the kernel covers it.
+// Arguments of `reached` (core/kernel.h) for a row: r_c^2, and the squared radius of the low pass, 0 if covered.
 struct ReachLevels {
   float r2, blur2;
 };

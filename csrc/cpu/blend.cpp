@@ -38,8 +38,8 @@ template <class S> class SurfelRun {
   bool any_textured() const { return any_textured_; }
   // Returns the index of block k's first fragment among `few`.
   BT_HD int number(int64_t k) const { return int(k - run.first) * kLanes; }
-  // Computes the colours of block k's fragments, 0 in other lanes, so that non-finite values stay in their own pixel.
-  // `residual`: of the block's first fragment; null: from texels. `under`: written if any are textured.
+  // Computes the colours of block k's fragments; 0 in other lanes, so that non-finite values stay in their own pixel.
+  // `residual`: of the first fragment; null: from texels. `under`: written if any are textured.
   BT_HD void colors(const BlockPart& part, int64_t k, const S* residual, BlockTexels<S>& under, P* to) const {
     P rgb[3] = {P(patch.view.x), P(patch.view.y), P(patch.view.z)};
     if (const uint32_t lanes = textured(k)) {
@@ -243,8 +243,8 @@ class ListedRuns {
   std::vector<Start> starts_;  // [runs + 1]
 };
 
-// Returns the runs grouped by surfel, surfels (at most n) in order of first appearance. Consecutive surfels are then
-// neighbours on the screen, so their runs lie close together in the list, as do their pixels.
+// Returns the runs grouped by surfel, surfels (at most n) in order of first appearance: consecutive ones are then
+// neighbours on the screen, and their runs and pixels close together in memory.
 std::vector<int64_t> by_surfel(const ListedRuns& runs, int64_t n) {
   std::vector<int32_t> rank(n, -1);
   std::vector<int64_t> next{0};  // number of runs of each rank, then the offset of its next one
@@ -276,8 +276,8 @@ template <class F> void for_surfels(const ListedRuns& runs, const int64_t* order
   });
 }
 
-// Prefetches data of the runs after run k of `order`, which are scattered over the list; stalls would dominate. First
-// their descriptions, then fragments and pixels. Always inlined: GCC drops calls of a function without other effects.
+// Prefetches data of the runs after run k of `order`, which are scattered over the list: first their descriptions, then
+// fragments and pixels. Always inlined: GCC drops calls of a function without other effects.
 template <int channels, class S>
 BT_HD void prefetch_next(const Backward<S>& a, const BlockPicture<S, channels>& dimage, const ListedRuns& listed,
                          const std::vector<int64_t>& order, int64_t k) {
@@ -313,8 +313,8 @@ template <class S> void move_texels(const S* rows, int64_t count, S rate, const 
   }
   for (; t < count; ++t) store3(texels + 3 * t, texel_step(load3(texels + 3 * t), load3(rows + 4 * t), rate, share[t]));
 }
-// Surfel by surfel: each thread adds to its own surfels' texels. Also used without learning texels, so that gradients
-// of surfels stay the same.
+// Surfel by surfel: each thread adds to its own surfels' texels. Also without learning texels, for equal gradients of
+// surfels.
 template <bool kMaps, class S>
 void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
                         const std::vector<int64_t>& order) {

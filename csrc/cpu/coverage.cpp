@@ -11,8 +11,8 @@ namespace {
 // Numbers in the sums of all parts but the first, at most.
 constexpr int64_t kMostSums = int64_t(1) << 28;
 
-// Calls fn(sums, tile) for every tile. Each part of the tiles has sums [rows, width] of its own; the first adds
-// to `out`, and reduce(to, from) adds a row of the others' to it.
+// Calls fn(sums, tile) for every tile. Each part of the tiles has its own sums [rows, width]; the first adds to `out`,
+// and reduce(to, from) adds a row of the others' to it.
 template <class S, class F, class Reduce>
 void each_part(const View<S>& view, Bins& bins, S* out, int64_t rows, int64_t width, F&& fn, Reduce&& reduce) {
   const auto lists = binner(view, bins);

@@ -186,7 +186,7 @@ std::vector<Occurrences> count_all(const IntegerColumn& column, const int64_t* v
   return found;
 }
 
-// Coding with a choice of `direct` and the order of `of`; bits(): its size.
+// Coding with a choice of `direct` and the order of `of`.
 class Attempt {
  public:
   Attempt(const IntegerColumn& column, int64_t centre, int direct, const Occurrences& of)

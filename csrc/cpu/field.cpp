@@ -32,8 +32,7 @@ template <class S> void clear(Mlp<S, Lanes<S>>& m) {
   std::fill(std::begin(m.w3), std::end(m.w3), Lanes<S>(S(0)));
 }
 
-// Encodes a batch of kBatch points; indices and weights are kept for the backward pass. Points beyond the count are not
-// looked up.
+// Encodes a batch of kBatch points; indices and weights are kept for the backward pass.
 template <class S> struct Encoder {
   using P = Lanes<S>;
   Corners<P> at[kMaxLevels];

@@ -28,8 +28,8 @@ namespace bt {
 template <class S> void project_forward(const ProjectForward<S>& a);
 template <class S> void project_backward(const ProjectBackward<S>& a);
 
-// Visible surfels per tile, front to back, and the squared radii of each surfel's level set in scale units, and of its
-// low pass in pixels, 0 where the kernel covers that.
+// Visible surfels per tile, front to back, and the squared radii of each surfel's level set, scale units, and of its
+// low pass, pixels, 0 where the kernel covers that.
 struct Bins {
   Bins() = default;
   Bins(const Bins&) = delete;  // or nanobind would offer copies
@@ -78,8 +78,8 @@ template <class S> struct Trace {
   Bins bins;
   FoundFragments<S> list;
 };
-// Adds what a view shows of its surfels: rows of `shown` are the largest transmittance of a blended fragment, and the
-// sums of the blending weights from `bound` on, and of all squared blending weights. `bins` is working memory.
+// Adds what a view shows of its surfels: largest transmittance in front of a blended fragment, and the sums of the
+// blending weights from `bound` on, and of all squared blending weights. `bins` is working memory.
 template <class S> struct SurfelCoverage {
   View<S> view;
   AlphaTiles<S> alpha;
@@ -97,9 +97,8 @@ template <class S> struct SurfelCoverage {
 };
 template <class S> void surfel_coverage(const SurfelCoverage<S>& a);
 
-// Adds what a view shows of the texels of tiles as in TexelTiles: rows of `covered` are the sums over fragments from
-// the weight `bound` on, at pixels with mask [height, width] not 0, of blending weight times bilinear weight, and of
-// squared blending weight times bilinear weight. `bins` is working memory.
+// Adds what a view shows of texels: sums over fragments from the weight `bound` on, at pixels with mask [height, width]
+// not 0, of blending weight times bilinear weight, and of squared blending weight times bilinear weight.
 template <class S> struct TexelCoverage {
   View<S> view;
   AlphaTiles<S> alpha;
@@ -212,8 +211,7 @@ template <class S> void blend_backward(const BlendBackward<S, TileBlocks>& a);
 template <class S> void learn_exposure(const LearnExposure<S>& a);
 template <class S> void ssim(const Ssim<S>& a);
 
-// An atlas in the renderer's form: every surfel's tile contiguous, row by row. On pages each row of a tile would cost a
-// cache line and a TLB entry.
+// An atlas with every surfel's tile contiguous: on pages each row of a tile would cost a cache line and a TLB entry.
 struct Patches {
   std::vector<uint8_t> bytes;  // RGBA, or empty
   std::vector<float> floats;   // RGBA, or empty
@@ -236,8 +234,7 @@ struct Pages {
 };
 // Throws std::invalid_argument for a tile outside its page.
 void gather_patches(const Pages& a, Patches& out);
-// Forward-only renderer of a baked scene: writes image [height, width, channels] and, unless null, overdraw [height,
-// width] int32. `bins` is working memory.
+// Renders a baked scene to image [height, width, channels] and, unless null, overdraw [height, width] int32.
 template <class S> struct BakedForward {
   View<S> view;
   const S* base;  // [n, 3] f_view
@@ -349,9 +346,8 @@ template <class S> struct FitSites {
   }
 };
 
-// Ranks the sites of each of n surfels by how much the colour needs them. While more than one is left, removes the site
-// whose removal changes c least: by w / (1 - w) (c - color) for a site of weight w, squared and summed over the
-// directions by their weights.
+// Ranks the sites of each of n surfels: while more than one is left, removes the site whose removal changes c least, by
+// w / (1 - w) (c - color) for a site of weight w, squared and summed over the directions by their weights.
 template <class S> struct RankSites {
   int64_t n;
   int sites, directions;
@@ -376,8 +372,7 @@ template <class S> void rank_sites(const RankSites<S>& a);
 // Layout of a column, a number per row, and what precedes it.
 struct IntegerColumn {
   int64_t rows;
-  // Number of blocks whose coefficients are the rows: coefficient 0 of every block, then coefficient 1, ... 0 = plain
-  // rows.
+  // Number of blocks whose coefficients are the rows: coefficient 0 of every block, then 1, ...; 0 = plain rows.
   int64_t blocks;
   const uint8_t* others;  // [rows] sum of the magnitudes of this row's earlier numbers, at most 2; null without any
 };

@@ -1,5 +1,4 @@
-// 16 lanes on the compiler's vector extensions, with the functions that core/ needs of a real; subsets of them: masks,
-// and loads and stores to contiguous memory.
+// 16 lanes on the compiler's vector extensions, with the functions that core/ needs of a real.
 #pragma once
 
 #include <array>
@@ -300,7 +299,6 @@ template <class S> BT_HD typename Lanes<S>::M finite_(Lanes<S> a) {
   return abs_(a) < Lanes<S>(std::numeric_limits<S>::infinity());  // false for NaN
 }
 
-// Subsets of lanes: mask, contiguous loads and stores.
 template <class S> BT_HD typename Lanes<S>::M mask_of(uint32_t lanes) {
   return mask_of_lanes<typename Lanes<S>::M>(lanes);
 }
@@ -308,8 +306,7 @@ template <class S> BT_HD void compress(S* to, Lanes<S> a, uint32_t lanes) { comp
 BT_HD void compress(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes(to, a, lanes); }
 template <class S> BT_HD void compress_only(S* to, Lanes<S> a, uint32_t lanes) { compress_lanes_only(to, a.v, lanes); }
 BT_HD void compress_only(int32_t* to, const Wide<int32_t>& a, uint32_t lanes) { compress_lanes_only(to, a, lanes); }
-// Stores selected lanes where memory up to `end` is written later anyway: masked stores cost dozens of operations on
-// AMD.
+// Stores selected lanes where memory up to `end` is written later anyway: masked stores are slow on AMD.
 template <class T, class V> BT_HD void compress_until(T* end, T* to, const V& a, uint32_t lanes) {
   end - to >= kLanes ? compress(to, a, lanes) : compress_only(to, a, lanes);
 }

@@ -27,7 +27,7 @@ template <class S> class LastRows {
   std::vector<S> numbers_;
 };
 
-// Working memory of a thread: the windows that begin in rows `from` to `to`, and the gradient.
+// Working memory of a thread.
 template <class S> class Band {
   using P = Lanes<S>;
 

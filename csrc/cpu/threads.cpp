@@ -36,10 +36,9 @@ void use_one_thread_after_fork() {
 }
 
 // libgomp's threads spin for milliseconds after every parallel region, also torch's, unless OMP_WAIT_POLICY or
-// GOMP_SPINCOUNT are set. It reads these once, when torch loads it: too late for a plugin. But according to its manual
-// it spins a thousandth of that while a process has more OpenMP threads than processors. A second team of the missing
-// threads, which sleeps for good, achieves this. A process with one thread has none that spin, and one that uses few of
-// the processors leaves the others alone: these get no team.
+// GOMP_SPINCOUNT are set, which it reads when torch loads it: too late for a plugin. But according to its manual it
+// spins a thousandth of that while a process has more OpenMP threads than processors: a second team of the missing
+// threads, which sleeps for good, achieves this. A process with one thread, or that uses few processors, gets none.
 void wait_without_spinning() {
 #if defined(_OPENMP)
   const int processors = omp_get_num_procs(), threads = omp_get_max_threads();

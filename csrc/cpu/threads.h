@@ -21,8 +21,7 @@
 
 namespace bt {
 
-// Threads of the kernels: as set, else OpenMP's. One in a forked child, whose copy of OpenMP would wait for threads
-// that only its parent has.
+// Threads of the kernels: as set, else OpenMP's; one in a forked child, whose OpenMP would wait for its parent's.
 int num_threads();
 void set_num_threads(int n);
 void use_one_thread_after_fork();  // registers the above
@@ -67,8 +66,8 @@ template <class F> void parallel_each(int64_t n, int64_t least, F&& fn) {
   });
 }
 
-// Splits items of cumulative cost `start` into `parts` of about equal cost, depending on the input alone, so that sums
-// over the parts do not depend on scheduling.
+// Splits items of cumulative cost `start` into `parts` of about equal cost, by the input alone: sums over the parts do
+// not depend on scheduling.
 inline std::vector<int64_t> balanced_parts(const int64_t* start, int64_t items, int parts) {
   std::vector<int64_t> cut(parts + 1, items);
   cut[0] = 0;
@@ -90,8 +89,8 @@ template <class F> int parallel_tiles(const int64_t* tile_start, int64_t tiles, 
   return parts;
 }
 
-// Threads that run the phases of one task together. OpenMP's threads sleep between parallel regions (threads.cpp), and
-// waking them takes 0.1 ms, as long as a small phase; a team waits awake.
+// Threads that run the phases of one task together, and wait awake: waking OpenMP's (threads.cpp) takes 0.1 ms, as long
+// as a small phase.
 class Team {
  public:
   struct Released {};  // thrown by meet() once a thread has failed, which will not come

@@ -113,7 +113,7 @@ void cut(const AlphaTiles<S>& tiles, int64_t id, const typename Lanes<S>::M& cov
   if (lanes) f.sigma = AlphaLanes<S>(patch, f.u, f.v, lanes).sigma(f.sigma);
 }
 
-// Prefetches the row of a surfel a few steps ahead, as a tile's surfels are scattered in memory.
+// Prefetches the row of a surfel a few steps ahead.
 constexpr int kAhead = 3;
 template <class S> BT_HD void prefetch(const View<S>& view, const Bins& bins, int64_t id) {
   __builtin_prefetch(view.geom + id * kGeom);

@@ -37,8 +37,8 @@ BT_VECTOR(uint64_t)
 #undef BT_VECTOR
 template <class T> using Vector = typename VectorOf<T>::type;
 
-// Masks are lanes of 0 or -1, as the compiler makes them (its choice of 64-bit integer type varies). With AVX-512 the
-// mask of floats is a mask register, as conversions between these and lanes would be frequent.
+// Masks are lanes of 0 or -1, as the compiler makes them (its choice of 64-bit integer type varies); with AVX-512 those
+// of floats are mask registers, as conversions would be frequent.
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 struct MaskOfFloats {
   __mmask16 m;
@@ -56,8 +56,7 @@ template <class H> struct Two {
   H low, high;
   Two() = default;
   BT_HD Two(const H& low, const H& high) : low(low), high(high) {}
-  // Explicit, so that copies are of whole vectors: the compiler's copies are smaller, and stall later loads of whole
-  // vectors.
+  // Explicit, as the compiler's copies are of smaller vectors, and stall later loads of whole ones.
   BT_HD Two(const Two& o) : low(o.low), high(o.high) {}
   BT_HD Two& operator=(const Two& o) {
     low = o.low, high = o.high;

@@ -79,8 +79,7 @@ template <class S> struct LearnExposure {
   }
 };
 
-// Mean SSIM of images a and b [height, width, channels] to value [1], and its gradient with respect to a to da unless
-// that is null.
+// Mean SSIM of images a and b [height, width, channels] to value [1], and its gradient to da unless that is null.
 template <class S> struct Ssim {
   int height, width, channels;
   const S *a, *b;

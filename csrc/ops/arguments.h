@@ -31,7 +31,7 @@ struct Workspace {
   }
 };
 
-// Fragments of a view, ordered by tile, then front to back by surfel, then by the layout.
+// Fragments of a view by tile, then front to back by surfel, then by the layout.
 template <class S> struct FragmentArrays {
   int64_t total;
   int32_t *surfel, *pixel;

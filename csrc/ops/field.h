@@ -7,8 +7,7 @@
 namespace bt {
 
 constexpr int kMlpWeights = kInputs * kWidth + kWidth * kWidth + kWidth * 3;  // w1, w2, w3, each input-major
-// Blocks of a backward pass on CUDA; fixed, so that sums do not depend on the GPU. Four per multiprocessor of an H100
-// (132).
+// Blocks of a backward pass on CUDA; fixed, so that sums do not depend on the GPU: four per multiprocessor of an H100.
 constexpr int kMostBlocks = 528;
 
 // Sizes in int64 of ExactRange (cuda/warp.h), and of exact sums of `entries` numbers.

@@ -44,8 +44,7 @@ template <class S> struct TexelPatch : TilePatch<S, 3> {
     return shaded(view, texel_mix(t, at.weight));
   }
 };
-// Working memory of the backward pass on CUDA: four gradient sums per texel, those of its three channels and that for
-// `squares` of BlendBackward, or 0.
+// Working memory of the backward pass on CUDA: gradient sums of a texel's three channels, and of `squares` or 0.
 template <class S> struct TexelWork {
   S* sums;         // [texels, 4]
   int64_t* exact;  // null, or order-independent sums instead of `sums`: [exact_size(...)]

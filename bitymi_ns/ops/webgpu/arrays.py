@@ -34,8 +34,8 @@ def _struct(name: str) -> np.dtype:
         offsets[field] = -(-end // alignment) * alignment
         formats.append(np.dtype((f"<{kind}4", (int(rows), width) if array else width if vector else ())))
         end = offsets[field] + formats[-1].itemsize
-    placed = {"names": list(offsets), "formats": formats, "offsets": list(offsets.values())}
-    return np.dtype({**placed, "itemsize": -(-end // 16) * 16})
+    size, starts = -(-end // 16) * 16, list(offsets.values())
+    return np.dtype({"names": list(offsets), "formats": formats, "offsets": starts, "itemsize": size})
 
 
 SURFEL, SEEN, FRAME = _struct("Surfel"), _struct("Seen"), _struct("Frame")

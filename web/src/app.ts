@@ -170,7 +170,7 @@ export class App implements Stage {
     this.go(shared);
   }
 
-  // Requests a new frame, for instance after texels have arrived.
+  // Requests a new frame.
   changed(): void {
     this.dirty = true;
     this.still = false;
@@ -371,10 +371,10 @@ export class App implements Stage {
     const image = element<HTMLImageElement>('photograph-image');
     image.removeAttribute('src');
     element('photograph-name').textContent = photograph ? 'Photograph' : 'No photograph of this camera';
-    const found = photograph ? this.bundle.photograph(photograph) : null;
-    this.photograph = found;
-    found?.then(
-      (address) => this.photograph === found && (image.src = address),
+    const address = photograph ? this.bundle.photograph(photograph) : null;
+    this.photograph = address;
+    address?.then(
+      (url) => this.photograph === address && (image.src = url),
       (error: unknown) => notify(reasonOf(error).message),
     );
   }

@@ -11,7 +11,7 @@ export interface Embedded {
   readonly notes: { names: string[]; goTo(name: string): boolean }; // false: no saved view of that name
 }
 
-// Returns the embedding page's origin: from the browser, this page before it loaded another bundle, or the referrer.
+// Returns the embedding page's origin, from the browser, this page before it loaded another bundle, or the referrer.
 function around(): string {
   const { ancestorOrigins } = location as { ancestorOrigins?: DOMStringList }; // not in all browsers
   const kept = new URLSearchParams(location.hash.slice(1)).get('embedder');
@@ -80,8 +80,8 @@ export class Embed {
     } else if (type === `${PREFIX}get-camera`) {
       this.send('camera', { id, camera: cameraOf(this.viewer.shared()) });
     } else if (type === `${PREFIX}set-camera`) {
-      const found = viewpointOf(camera as Camera);
-      if (found) this.viewer.apply({ ...this.viewer.shared(), ...found });
+      const viewpoint = viewpointOf(camera as Camera);
+      if (viewpoint) this.viewer.apply({ ...this.viewer.shared(), ...viewpoint });
       else refuse('camera must have position, right, forward, target and lens.');
     } else if (type === `${PREFIX}list-views`) {
       this.send('views', { id, views: this.viewer.notes.names });

@@ -71,7 +71,6 @@ async function load(opened: Promise<Source>, opening: Promise<Graphics>): Promis
   return loadBundle(from, info, showProgress, admit, notify);
 }
 
-// Shows an error, except that of a page that shows a picture instead.
 const unlessPicture = (error: unknown): void => {
   if (!(error instanceof NoGraphics)) showError(error);
 };

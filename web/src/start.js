@@ -1,7 +1,7 @@
 /* global document, location, addEventListener, HTMLScriptElement */
-// Inline script that locates the page's scripts. An address ending in /fox without a slash means the folder fox, to
-// which names are then relative, or, on servers that hide extensions, fox.html: scripts that the folder lacks are requested
-// beside it. It also explains why the page does not start, if the page's script cannot.
+// Inline script that locates the page's scripts, or explains why it does not start. An address ending in /fox without a
+// slash means the folder fox, to which names are then relative, or, on servers that hide extensions, fox.html: scripts
+// that the folder lacks are requested beside it.
 (function () {
   const root = document.documentElement;
   const name = location.pathname.split('/').pop();

@@ -1,6 +1,5 @@
 // Screen rectangles that bound a surfel: the level set sigma = 1/255 of the kernel and of the low pass. As
-// core/footprint.h, but along the axes of the surfel's image, as a rasterizer draws any rectangle: a long thin
-// surfel then costs only its own area.
+// core/footprint.h, but along the axes of the surfel's image: a long thin surfel then costs only its own area.
 
 struct Rectangle {
   visible: bool,
@@ -58,8 +57,8 @@ fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
 const CORNERS: u32 = 8;  // of a polygon about the disc
 const MOST_CORNERS: u32 = CORNERS + 5;  // each plane adds one
 
-// Clips a polygon around the disc to `near` and the image, and adds the low pass: for discs that cross the camera's
-// plane, whose image is no ellipse, and for ellipses larger than the screen.
+// Clips a polygon around the disc to `near` and the image, and adds the low pass: for discs across the camera's plane,
+// whose image is no ellipse, and for ellipses larger than the screen.
 fn clipped(s: Seen, p: vec2f, q: vec2f, c: vec2f, blur: f32) -> Rectangle {
   let border = select(-s.center, min(frame.size - s.center, vec2f(0.0)), s.center >= vec2f(0.0));
   var low = vec2f(-blur);
@@ -158,7 +157,6 @@ fn rectangle(s: Seen) -> Rectangle {
   return r;
 }
 
-// Returns true if the rectangle meets the image.
 fn on_screen(r: Rectangle) -> bool {
   let box = abs(r.axis) * r.half_size.x + abs(r.axis.yx) * r.half_size.y;
   return r.visible && all(r.middle + box >= vec2f(0.0)) && all(r.middle - box <= frame.size);

@@ -2,8 +2,8 @@
 // remaining transmittance. Blending does the rest of core/blend.h:
 //   sums += transmittance * (sigma * color),   transmittance *= 1 - sigma.
 //
-// Blending does not expose a fragment's weight. Tests of the weight (bound of residual and alpha, end of a pixel) use
-// the transmittance before the batch, an upper bound; more batches tighten it. docs/viewer.md has the image error.
+// Blending does not expose a fragment's weight: tests of it (bound of residual and alpha, end of a pixel) use the
+// transmittance before the batch, an upper bound that more batches tighten. docs/viewer.md has the image error.
 
 @group(0) @binding(0) var<uniform> frame: Frame;
 @group(0) @binding(1) var<storage, read> surfels: array<Surfel>;
@@ -14,7 +14,7 @@
 @group(1) @binding(1) var bilinear: sampler;
 @group(1) @binding(2) var coarser: texture_2d_array<f32>;  // levels 1 and 2 of the tiles, as its levels 0 and 1
 @group(2) @binding(0) var<uniform> layer: vec4u;  // x: batch
-@group(2) @binding(1) var before: texture_2d<f32>;  // the target before this batch
+@group(2) @binding(1) var before: texture_2d<f32>;  // target before this batch
 
 struct Corner {
   @builtin(position) position: vec4f,

@@ -1,4 +1,4 @@
-// Adaptation of surfels to views of another size than the training photographs, as core/resize.h and core/texel.h.
+// Adaptation of surfels to views of another size than the photographs, as core/resize.h and core/texel.h.
 
 // Computes the variance that a pixel adds along each axis, pixels^2.
 fn pixel_variance() -> f32 {
@@ -38,7 +38,7 @@ fn resized(seen: Seen) -> Seen {
   return s;
 }
 
-// Selects the level of a tile with about one texel per pixel, limited to the tile's levels.
+// Selects the level of a tile with about one texel per pixel.
 fn tile_level(s: Seen, surfel: Surfel) -> u32 {
   if surfel.sides == 0 || frame.detail == DETAIL_MEANS { return TILE_LEVELS; }
   let p = frame.photo_pixel;

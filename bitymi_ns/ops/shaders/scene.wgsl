@@ -1,7 +1,5 @@
-// Declarations shared by the shaders of a baked scene: constants, surfels, frame uniforms.
-//
-// These shaders are the renderer of both the browser viewer and the package's `webgpu` backend. csrc/core explains
-// their formulas.
+// Declarations shared by the shaders of a baked scene, which the browser viewer and `ops.webgpu` draw with. csrc/core
+// explains their formulas.
 
 const SUPPORT: f32 = 3.0;
 const SUPPORT2: f32 = 9.0;
@@ -68,10 +66,9 @@ struct Frame {
   show: u32,  // SHOW_*
   residuals: u32,  // 1: add residuals
   photo_pixel: f32,  // side of a photograph's pixel in pixels of the view: resize.wgsl
-  detail: u32,  // DETAIL_*
+  detail: u32,  // DETAIL_*: available residuals
 }
 
-// Available residuals.
 const DETAIL_MEANS: u32 = 0;  // means only, texels are still loading
 const DETAIL_TEXELS: u32 = 1;
 const DETAIL_ALL: u32 = 2;

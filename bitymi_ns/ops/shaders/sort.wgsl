@@ -1,6 +1,5 @@
-// Sorts (key, value) pairs by 4 bits of the key, lowest first; eight rounds sort completely. The sort is stable, so
-// surfels of equal depth keep their order. Each round has three kernels, as workgroups of one dispatch must not wait
-// for each other: forward progress is not guaranteed.
+// Sorts (key, value) pairs stably by 4 bits of the key, lowest first; eight rounds sort completely. Each round has three
+// kernels, as workgroups of one dispatch must not wait for each other: forward progress is not guaranteed.
 //
 //   count    histogram of digits per block of 1,024 keys
 //   scan     first output position per digit and block
@@ -60,13 +59,13 @@ fn scan(@builtin(local_invocation_index) thread: u32) {
   }
   var before = sums[thread] - total;
   for (var i = begin; i < end; i++) {
-    let found = table[i];
+    let size = table[i];
     table[i] = before;
-    before += found;
+    before += size;
   }
 }
 
-// Counters of 16 digits, 16 bits each: digit d in half d % 2 of word d / 2.
+// 16-bit counters of 16 digits: digit d in half d % 2 of word d / 2.
 struct Counts {
   low: vec4u,
   high: vec4u,

@@ -1,5 +1,5 @@
-// Parts of a bundle in one file: an uncompressed ZIP, written by bitymi_ns/bundle/single.py, and read as
-// bitymi_ns/bundle/parts.py reads it. Hashes in bundle.json decide whether the parts are whole.
+// Parts of a bundle in one file, an uncompressed ZIP, as bitymi_ns/bundle/parts.py reads them. Hashes in bundle.json
+// decide whether they are whole.
 import { DamagedBundle } from '../errors';
 
 export interface Entry {
@@ -14,7 +14,7 @@ const END = { signature: 0x06054b50, bytes: 22 };
 const CENTRAL = { signature: 0x02014b50, bytes: 46 };
 const LOCAL = { signature: 0x04034b50, bytes: 30 };
 const LONGEST = 1 << 22; // bytes of a directory
-const SLACK = 64; // most bytes by which a part's header is longer than 30 and its name
+const SLACK = 64; // most bytes of a part's header beyond LOCAL and its name
 const NAME = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
 
 const damaged = (what: string): DamagedBundle => new DamagedBundle(`The file is no bundle in one file: ${what}.`);

@@ -1,5 +1,5 @@
-// Decodes BC7 blocks to RGBA texels, for adapters without BC7 textures. Written from the tables of the Khronos Data
-// Format Specification; a test compares it with another decoder, block by block.
+// Decodes BC7 blocks to RGBA texels, for adapters without BC7 textures. Tables are those of the Khronos Data Format
+// Specification.
 
 interface Mode {
   subsets: number;
@@ -27,8 +27,7 @@ const WEIGHTS: Record<number, number[]> = {
   3: [0, 9, 18, 27, 37, 46, 55, 64],
   4: [0, 4, 9, 13, 17, 21, 26, 30, 34, 38, 43, 47, 51, 55, 60, 64],
 };
-// Per partition: each texel's subset, in one or two bits; and the anchor texels, whose highest index bit is 0 and not
-// stored.
+// Per partition: each texel's subset, in one or two bits; anchor texels, whose highest index bit is 0 and not stored.
 const TWO = [
   0xcccc, 0x8888, 0xeeee, 0xecc8, 0xc880, 0xfeec, 0xfec8, 0xec80, 0xc800, 0xffec, 0xfe80, 0xe800, 0xffe8, 0xff00,
   0xfff0, 0xf000, 0xf710, 0x8e, 0x7100, 0x8ce, 0x8c, 0x7310, 0x3100, 0x8cce, 0x88c, 0x3110, 0x6666, 0x366c, 0x17e8,

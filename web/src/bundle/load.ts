@@ -60,9 +60,9 @@ export async function loadBundle(
   const photograph = (name: string): Promise<string> => {
     const made = async (): Promise<string> =>
       URL.createObjectURL(new Blob([await beside(name)], { type: 'image/jpeg' }));
-    const found = addresses.get(name) ?? made();
-    addresses.set(name, found);
-    return found;
+    const address = addresses.get(name) ?? made();
+    addresses.set(name, address);
+    return address;
   };
   const [, cameras, table, atlas] = await Promise.all([admit(info), views(), ...first.map(load)]);
   if (!info.compact) {

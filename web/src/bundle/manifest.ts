@@ -125,13 +125,13 @@ function atlas(r: Reader, isCompact: boolean, surfelBytes: number) {
     extent: r.has('extent') ? r.number('extent') : EXTENT,
     offset: r.number('offset'),
     scale: r.number('scale'),
-    alphaScale: r.has('alpha_scale') ? r.number('alpha_scale') : 0, // times a texel's alpha, of sigma; 0: opaque scene
+    alphaScale: r.has('alpha_scale') ? r.number('alpha_scale') : 0, // 0: opaque scene
     coded: isCompact ? texels(r, surfelBytes) : null, // format dct
   };
 }
 export type Atlas = ReturnType<typeof atlas>;
 
-// Reads points of the scene with the pixels per unit of length of their photographs.
+// Reads points of the scene, with the pixels per unit of length of their photographs.
 function points(r: Reader): Float32Array {
   const text = r.text('photographed', /^[A-Za-z0-9+/]*={0,2}$/);
   const refuse = (): never => {

@@ -1,5 +1,4 @@
-// Pictures of a bundle's first view: the poster, shown before the surfels arrive, and the preview, shown where nothing
-// can draw.
+// Pictures of a bundle's first view: the poster until the surfels arrive, the preview where nothing can draw.
 import { MOST_BESIDE, readPart } from './load';
 import type { Manifest } from './manifest';
 import type { Source } from './source';
@@ -22,25 +21,19 @@ export function isPoster(data: ArrayBuffer): boolean {
   return sides.every((side) => side >= 1 && side <= MOST_SIDE);
 }
 
-// Loads the poster; null if missing or damaged.
-export async function loadPoster(source: Source, info: Manifest): Promise<Blob | null> {
-  const entry = info.files.get(POSTER);
-  if (!entry || entry.bytes > MOST_BYTES) return null;
-  try {
-    const data = await readPart(source, info, POSTER, () => undefined);
-    return isPoster(data) ? new Blob([data], { type: 'image/webp' }) : null;
-  } catch {
-    return null;
-  }
+// Reads a file of at most `most` bytes; null if missing or damaged.
+async function read(source: Source, info: Manifest, name: string, most: number): Promise<ArrayBuffer | null> {
+  if ((info.files.get(name)?.bytes ?? Infinity) > most) return null;
+  return readPart(source, info, name, () => undefined).catch(() => null);
 }
 
-// Loads the preview; null if missing or damaged.
+export async function loadPoster(source: Source, info: Manifest): Promise<Blob | null> {
+  const data = await read(source, info, POSTER, MOST_BYTES);
+  return data && isPoster(data) ? new Blob([data], { type: 'image/webp' }) : null;
+}
+
 export async function loadPreview(source: Source, info: Manifest): Promise<Blob | null> {
-  const name = ['preview.jpg', 'preview.png'].find((each) => (info.files.get(each)?.bytes ?? Infinity) <= MOST_BESIDE);
-  if (!name) return null;
-  const type = name.endsWith('png') ? 'image/png' : 'image/jpeg';
-  return readPart(source, info, name, () => undefined).then(
-    (data) => new Blob([data], { type }),
-    () => null,
-  );
+  const [name, type] = info.files.has('preview.jpg') ? ['preview.jpg', 'image/jpeg'] : ['preview.png', 'image/png'];
+  const data = await read(source, info, name, MOST_BESIDE);
+  return data && new Blob([data], { type });
 }

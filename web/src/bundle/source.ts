@@ -5,18 +5,16 @@ import { type Entry, TAIL, entriesOf, partOf, placeOf } from './archive';
 export type Came = (bytes: number) => void;
 const nothing: Came = () => undefined;
 const MANIFEST = 'bundle.json';
-// Names of single-file bundles beside the page that it may be asked to show.
+// Names of single-file bundles that the page may be asked to show.
 export const BESIDE = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}\.bitymi$/;
 const MOST_MANIFEST = 1 << 22; // bytes
 const NOTES = 'notes.json';
 const MOST_NOTES = 1 << 18; // bytes
 
 export interface Source {
-  // Reads a file of `size` bytes.
   read(name: string, size: number, came: Came): Promise<ArrayBuffer>;
-  // Reads bundle.json, whose size is unknown.
   manifest(): Promise<string>;
-  // Reads notes.json, null if there is none; `stated`: whether view.json of a folder lists it.
+  // Null if there is no notes.json; `stated`: whether view.json of a folder lists it.
   notes(stated: boolean): Promise<string | null>;
 }
 
@@ -37,7 +35,7 @@ async function get(url: string, range?: string): Promise<Response> {
   return response;
 }
 
-// Reads a response of at most `most` bytes, allocating only what has arrived.
+// Allocates only what has arrived.
 async function bytesOf(response: Response, name: string, most: number, came: Came): Promise<Uint8Array<ArrayBuffer>> {
   const parts: Uint8Array[] = [];
   let at = 0;

@@ -31,17 +31,15 @@ export const alphaWord = (m: number): number => (Math.min(Math.round(128 * m), 2
 export const layerIn = (word: number): number => word & 0xffffff;
 export const alphaIn = (word: number): number => (word >>> 24) / 128;
 
-// Returns the scene's centre, as the origin of positions: in float32 they lack precision far from the world's origin.
+// Returns the scene's centre, as the origin of positions, which in float32 lack precision far from the world's.
 export const originOf = ({ bounds }: Manifest): Vec3 => bounds.min.map((low, c) => (low + bounds.max[c]) / 2) as Vec3;
 
-// Subtracts the origin from the means.
 export function centred(words: Float32Array, origin: Vec3): void {
   for (let i = WORD.mean; i < words.length; i += SURFEL_WORDS) {
     for (let c = 0; c < 3; c++) words[i + c] -= origin[c];
   }
 }
 
-// Sets the tile of surfel i: its first texel, layer and sides.
 export function setTile(
   words: Float32Array,
   i: number,
@@ -117,7 +115,6 @@ function tiles(rows: Table, words: Float32Array, info: Manifest): void {
   }
 }
 
-// Reads mean alphas.
 function alphas(rows: Table, words: Float32Array): void {
   const numbers = new Uint32Array(words.buffer);
   const means = new Float32Array(rows.count);

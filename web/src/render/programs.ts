@@ -70,9 +70,9 @@ export class Programs {
   }
 
   private once(key: string, descriptor: GPURenderPipelineDescriptor): GPURenderPipeline {
-    const found = this.made.get(key) ?? this.device.createRenderPipeline(descriptor);
-    this.made.set(key, found);
-    return found;
+    const pipeline = this.made.get(key) ?? this.device.createRenderPipeline(descriptor);
+    this.made.set(key, pipeline);
+    return pipeline;
   }
 
   draw(format: TargetFormat, how: 'blend' | 'count'): GPURenderPipeline {

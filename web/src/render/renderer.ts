@@ -100,12 +100,12 @@ export class Renderer {
     const { info, surfels } = this.scene;
     if (!info.photographed?.length) return [{ samples: 1, photoPixel: 1 }, whole];
     const size = sizeOf(info.photographed, view);
-    const found = isFar(size) && options.fine ? partOf(surfels.words, view.from(surfels.origin), info.near) : whole;
-    const [left, top, right, bottom] = found;
+    const shown = isFar(size) && options.fine ? partOf(surfels.words, view.from(surfels.origin), info.near) : whole;
+    const [left, top, right, bottom] = shown;
     const [width, height] = [right - left, bottom - top];
     const most = options.fine ? Math.max(1, Math.floor(this.largestSide / Math.max(width, height))) : 1;
     const sampling = samplingOf(size, width * height, most, MOST_PIXELS);
-    return [sampling, sampling.samples > 1 ? found : whole];
+    return [sampling, sampling.samples > 1 ? shown : whole];
   }
 
   private setFrame(view: View, width: number, height: number, photoPixel: number, options: DrawOptions): void {
@@ -190,7 +190,6 @@ export class Renderer {
     return queue.onSubmittedWorkDone();
   }
 
-  // Draws the depths of a view.
   async depths(view: View, options: DrawOptions): Promise<Depths> {
     const encoder = this.graphics.device.createCommandEncoder();
     const { width, height, format, sums } = this.encode(encoder, view, { ...options, show: 'depth' }).target;
@@ -203,8 +202,8 @@ export class Renderer {
       const channel = (c: number): number =>
         bytes === 16 ? pixel.getFloat32(4 * c, true) : half(pixel.getUint16(2 * c, true));
       const covered = 1 - channel(3); // draw.wgsl
-      const found = (channel(0) / covered) * options.farthest;
-      depth[i] = covered >= 0.5 && found < Infinity ? found : Infinity; // also NaN
+      const mean = (channel(0) / covered) * options.farthest;
+      depth[i] = covered >= 0.5 && mean < Infinity ? mean : Infinity; // also NaN
     }
     return { width, height, depth };
   }

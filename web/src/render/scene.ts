@@ -11,6 +11,7 @@ import { type Programs, SORT_ENTRIES, type SortEntry } from './programs';
 
 export const STRIDE = 256; // offset alignment of the batches' uniforms
 const NO_OPACITY = -1e4; // logit
+const NO_PAGES: Pages = { width: 1, height: 1, layers: [new Uint8Array(4)], format: 'uint8' };
 
 type Resource = GPUBuffer | GPUTextureView | GPUSampler;
 
@@ -112,7 +113,6 @@ export class SceneOnDevice {
     if (this.count) this.device.queue.writeBuffer(this.stored, 0, words as Float32Array<ArrayBuffer>);
   }
 
-  // Sets texels that arrived later.
   setTexels(pages: Pages): void {
     this.atlas = this.texture(pages);
     this.coarser = null;
@@ -129,7 +129,7 @@ export class SceneOnDevice {
     return group(this.device, this.programs.layouts[1], [atlas, sampler, coarser]);
   }
 
-  // Makes the levels 1 and 2 of the tiles once, for views smaller than the photographs.
+  // Makes the levels 1 and 2 of the tiles, for views smaller than the photographs.
   makeCoarser(): void {
     if (this.coarser || !this.complete) return;
     const { width, height, depthOrArrayLayers: layers } = this.atlas;
@@ -176,12 +176,7 @@ export class SceneOnDevice {
   }
 
   private texture(pages: Pages | null): GPUTexture {
-    const { width, height, layers, format } = pages ?? {
-      width: 1,
-      height: 1,
-      layers: [new Uint8Array(4)],
-      format: 'uint8' as const,
-    };
+    const { width, height, layers, format } = pages ?? NO_PAGES;
     const decode = format === 'bc7' && !this.graphics.blocks;
     const names = { bc7: decode ? 'rgba8unorm' : 'bc7-rgba-unorm', uint8: 'rgba8unorm', fp16: 'rgba16float' } as const;
     const texture = this.device.createTexture({

@@ -40,7 +40,6 @@ export class Pace {
   scale = 1;
   milliseconds = 0; // per frame, smoothed
 
-  // Updates the scale after a frame at the current one.
   took(milliseconds: number): void {
     this.milliseconds = this.milliseconds ? 0.7 * this.milliseconds + 0.3 * milliseconds : milliseconds;
     const wish = this.scale * Math.sqrt((0.85 * FRAME_MILLISECONDS) / Math.max(this.milliseconds, 0.5));

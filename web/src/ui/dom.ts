@@ -41,7 +41,6 @@ export const typing = (target: EventTarget | null): boolean =>
 export const writing = (target: EventTarget | null): boolean =>
   typing(target) && !(target instanceof HTMLInputElement && target.type === 'range');
 
-// Offers a file for download.
 export function download(name: string, data: Blob): void {
   const link = make('a', { href: URL.createObjectURL(data), download: name });
   link.click();

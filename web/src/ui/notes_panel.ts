@@ -1,6 +1,5 @@
 // Saved views and notes: their lists, and the markers of notes over the scene.
-import { LONGEST_NAME, LONGEST_TEXT, MOST_NOTES, MOST_VIEWS, type Note, type Notes } from '../view/notes';
-import { cleared } from '../view/notes';
+import { LONGEST_NAME, LONGEST_TEXT, MOST_NOTES, MOST_VIEWS, type Note, type Notes, cleared } from '../view/notes';
 import { type View, moved } from '../view/pose';
 import { length, subtract } from '../view/vector';
 import { button, element, make, onClick, toggle } from './dom';
@@ -41,9 +40,9 @@ export class NotesPanel {
 
   // Goes to a view by name; returns whether it exists.
   goTo(name: string): boolean {
-    const found = this.all.views.find((view) => view.name === name);
-    if (found) this.stage.fly(found.viewpoint);
-    return found !== undefined;
+    const named = this.all.views.find((view) => view.name === name);
+    if (named) this.stage.fly(named.viewpoint);
+    return named !== undefined;
   }
 
   // Moves the markers to their notes' positions in a view; `still`: also finds which are hidden by surfels.

@@ -1,5 +1,5 @@
 // Panel of the camera path: list of keyframes, playback, saving.
-import { CameraPath, LONGEST, SECONDS, SHORTEST } from '../view/path';
+import { CameraPath, LONGEST, SECONDS, SHORTEST, within } from '../view/path';
 import type { Pose, View } from '../view/pose';
 import { button, download, element, make, onClick, press, toggle } from './dom';
 import { notify } from './pages';
@@ -184,7 +184,6 @@ export class PathPanel {
   }
 }
 
-// Input for the duration of a segment.
 function secondsOf(from: number, to: number, keyframe: { seconds: number }, changed: () => void): HTMLElement {
   const ariaLabel = `Seconds from keyframe ${from} to ${to}`;
   const limits = { min: `${SHORTEST}`, max: `${LONGEST}`, step: 'any' };
@@ -192,7 +191,7 @@ function secondsOf(from: number, to: number, keyframe: { seconds: number }, chan
   input.value = String(Number(keyframe.seconds.toFixed(2)));
   input.onchange = () => {
     const wanted = input.valueAsNumber;
-    if (wanted > 0) keyframe.seconds = Math.min(LONGEST, Math.max(SHORTEST, wanted));
+    if (wanted > 0) keyframe.seconds = within(wanted);
     changed();
   };
   return make('label', { className: 'seconds' }, input, ' s');

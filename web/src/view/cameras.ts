@@ -34,7 +34,7 @@ function camera(row: unknown) {
     pose: { position: times(-1, back), right, down, forward },
     lens,
     photograph, // file in the bundle, or null
-    correction: correctionOf(r.correction), // of the scene's colours to the photograph's: matrix and offset [3, 4] by rows
+    correction: correctionOf(r.correction), // of the scene's colours to the photograph's: matrix and offset [3, 4]
   };
 }
 export type CaptureCamera = NonNullable<ReturnType<typeof camera>>;
@@ -57,10 +57,10 @@ export function parseCameras(text: string): CaptureCamera[] {
 // Returns the correction of the camera with a given pose; null without such a camera, or if it has none.
 export function correctionAt(cameras: CaptureCamera[], pose: Pose): number[] | null {
   const same = (a: Vec3, b: Vec3): boolean => length(subtract(a, b)) < SAME * (1 + length(b));
-  const found = cameras.find(
+  const there = cameras.find(
     ({ pose: p }) => same(pose.position, p.position) && same(pose.right, p.right) && same(pose.forward, p.forward),
   );
-  return found?.correction ?? null;
+  return there?.correction ?? null;
 }
 
 // Computes the point nearest to all optical axes by least squares; null if they are parallel.

@@ -127,7 +127,7 @@ function measureOf(value: unknown, where: string): Measure {
 // Removes control characters.
 export const cleared = (text: string): string => text.replace(CONTROLS, '');
 
-// Parses notes.json; throws an error that names an invalid entry.
+// Throws an error that names an invalid entry.
 export function parseNotes(text: string): Notes {
   const json: unknown = JSON.parse(text);
   const { version } = (json ?? {}) as Json;

@@ -34,7 +34,7 @@ export class CameraPath {
   // Scales all segments to a total duration.
   set seconds(wanted: number) {
     const k = wanted / this.seconds;
-    for (const each of this.keyframes) each.seconds = Math.min(LONGEST, Math.max(SHORTEST, k * each.seconds));
+    for (const keyframe of this.keyframes) keyframe.seconds = within(k * keyframe.seconds);
   }
 
   // Returns the view at a time for a picture size; needs two keyframes.
@@ -153,8 +153,8 @@ export class Flight {
 }
 
 const fovOf = (fy: number, height: number): number => (360 / Math.PI) * Math.atan(height / 2 / fy); // degrees
-const secondsOf = (given: unknown): number | null =>
-  typeof given === 'number' && given > 0 ? Math.min(LONGEST, Math.max(SHORTEST, given)) : null;
+export const within = (seconds: number): number => Math.min(LONGEST, Math.max(SHORTEST, seconds)); // of a segment
+const secondsOf = (given: unknown): number | null => (typeof given === 'number' && given > 0 ? within(given) : null);
 
 // Reads keyframe k of a file; its seconds count from the previous keyframe.
 function keyframeOf(row: Record<string, unknown>, k: number, usual: number): Keyframe {

@@ -57,8 +57,8 @@ export function partOf(words: Float32Array, view: View, near: number): Part {
   return [left, top, end, bottom];
 }
 
-// Chooses the samples per pixel, along each axis, of a view with `pixels`, and with them the side of a photograph's pixel
-// in samples; at most `mostSamples` per pixel and axis, and `mostPixels` in all.
+// Chooses the samples per pixel and axis of a view with `pixels`, and with them the side of a photograph's pixel in
+// samples; at most `mostSamples` per pixel and axis, and `mostPixels` in all.
 export function samplingOf(size: number, pixels: number, mostSamples: number, mostPixels: number) {
   const [low, high] = AS_TRAINED;
   if (low <= size && size <= high) return { samples: 1, photoPixel: 1 };

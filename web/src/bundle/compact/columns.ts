@@ -49,7 +49,7 @@ class Bytes {
   }
 }
 
-// Reads the tables of all contexts, TOTAL slots each. By slot: its token, and TOTAL times the token's frequency, plus the
+// Reads the tables of all contexts. By slot, TOTAL per context: its token, and TOTAL times the token's frequency plus the
 // slot's index among the token's; 0 in a context without table.
 function readTables(bytes: Bytes, contexts: number, most: number) {
   const [tokens, steps] = [new Uint16Array(contexts * TOTAL), new Int32Array(contexts * TOTAL)];
@@ -70,9 +70,9 @@ function readTables(bytes: Bytes, contexts: number, most: number) {
   return { tokens, steps };
 }
 
-// Decodes one number of every row of a column into `codes`. blocks: number of blocks whose coefficients the rows are;
-// 0 = plain rows. sums: by row, the sum of the magnitudes of its earlier numbers, at most 2, to which these are added;
-// null = not needed. number: index of the number in a row.
+// Decodes a number of every row of a column into `codes`. blocks: number of blocks whose coefficients the rows are;
+// 0 = plain rows. sums: by row, the magnitudes of its earlier numbers, at most 2 in all, to which these are added; null
+// = not needed. number: index in a row.
 function decodeIntegers(
   data: Uint8Array,
   codes: Float64Array | Int32Array,
@@ -174,8 +174,8 @@ const bytesOf = ({ bytes }: Column): number => bytes.reduce((sum, size) => sum +
 // Checks that the columns are as expected ([name, numbers per row]) and fill the file.
 export function checkColumns(columns: Column[], expected: [string, number][], size: number, file: string): void {
   const names = (list: string[]): string => list.join(', ') || 'none';
-  const [found, wanted] = [columns.map((c) => c.name), expected.map(([name]) => name)];
-  if (names(found) !== names(wanted)) throw new DamagedBundle(`${file}: its columns are ${names(found)}.`);
+  const listed = names(columns.map((column) => column.name));
+  if (listed !== names(expected.map(([name]) => name))) throw new DamagedBundle(`${file}: its columns are ${listed}.`);
   columns.forEach((column, k) => {
     const [name, numbers] = expected[k];
     if (column.bytes.length !== numbers) {
@@ -208,7 +208,6 @@ export class ColumnReader {
     return bytes.map((size, number) => this.decode(size, make(rows), blocks, sums, number));
   }
 
-  // Decodes one number of all rows by decodeIntegers.
   private decode<T extends Codes>(size: number, codes: T, blocks: number, sums: Uint8Array | null, number: number): T {
     try {
       decodeIntegers(this.data.subarray(this.at, this.at + size), codes, blocks, sums, number);

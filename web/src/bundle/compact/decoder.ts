@@ -1,4 +1,4 @@
-// Decodes compact bundles in workers, to keep the page responsive. Sizes bound the time: there is no other limit.
+// Decodes compact bundles in workers, to keep the page responsive. Sizes alone bound the time.
 import { ViewerError } from '../../errors';
 import type { Pages } from '../ktx2';
 import type { Atlas, Manifest } from '../manifest';

@@ -1,4 +1,4 @@
-// Packs tiles into the pages of an atlas from their sizes, as bitymi_ns/codec/packing.py.
+// Packs tiles into the pages of an atlas, as bitymi_ns/codec/packing.py.
 import { DamagedBundle } from '../../errors';
 import { GRID, ROWS } from '../tables';
 
@@ -28,8 +28,8 @@ export function pack(u: Uint16Array, v: Uint16Array, pageWidth: number, mostRows
     widest = Math.max(widest, u[i]);
     tallest = Math.max(tallest, v[i]);
     const key = v[i] * 65536 + u[i];
-    const of = classes.get(key);
-    if (of) of.push(i);
+    const alike = classes.get(key);
+    if (alike) alike.push(i);
     else classes.set(key, [i]);
   }
   if (!area) return { width: GRID, height: GRID, layers: 1, ...found };

@@ -30,8 +30,7 @@ const cosines = (count: number): Float64Array =>
   });
 
 // Returns the inverse cosine transform of blocks of u x v texels: `across` [u, u] and `down` [v, v], frequency by
-// position; by coefficient in stored order the offset of the row of its frequency along v in `half`, and along u in
-// `across`.
+// position; by coefficient in stored order the offset of its frequency along v in `half`, and along u in `across`.
 function transformOf(u: number, v: number) {
   const order: [number, number][] = [];
   for (let k_v = 0; k_v < v; k_v++) for (let k_u = 0; k_u < u; k_u++) order.push([k_v, k_u]);
@@ -84,7 +83,6 @@ interface Blocks {
   texels: number; // in all of them
 }
 
-// Rounds to the nearest byte.
 const byteOf = (x: number): number => (x > 0 ? (x < 255 ? (x + 0.5) | 0 : 255) : 0);
 
 class Painter {

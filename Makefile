@@ -12,8 +12,8 @@
 #              records the versions (8 GB and half an hour each); ENDS=oldest or newest: one of them; DATA=capture
 # make wheel   builds a wheel in dist/; with CUDA=1 one that has the kernels for GPUs of compute capability 7.5 to 12.0
 #              (ARCHITECTURES) and needs nvcc here, not where it is installed
-# make gate    trains, bakes and draws a fixed small scene (and DATA=folder) and compares quality, bytes, memory and time
-#              with the committed baseline, benchmarks/gate.json; make gate-accept renews the baseline
+# make gate    trains, bakes and draws a fixed small scene and compares quality, bytes, memory and time with the
+#              committed baseline, benchmarks/gate.json; make gate-accept renews the baseline
 # make web     builds the viewer's page from web/ into bitymi_ns/view/page, which is committed: users need no Node.js
 # make web-test  checks and tests of the page's sources, and that the committed page is what they give; says that it is
 #              skipped where there is no Node.js. `make test` begins with it
@@ -126,7 +126,7 @@ web-test-here: web/node_modules/.package-lock.json
 	  echo "bitymi_ns/view/page is not what web/ gives: run make web, and commit it" >&2; exit 1; }
 
 gate gate-accept: setup
-	$(BIN)/python benchmarks/gate.py $(if $(DATA),--capture "$(DATA)") $(if $(filter %-accept,$@),--accept)
+	$(BIN)/python benchmarks/gate.py $(if $(filter %-accept,$@),--accept)
 
 wheel: $(VENV)/.stamp-deps
 	$(PIP) wheel -q --no-build-isolation --no-deps -w dist $(DEFINE).BITYMI_CUDA=$(if $(CUDA),ON,OFF) \

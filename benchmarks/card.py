@@ -1,10 +1,9 @@
 #!/usr/bin/env python
 """Transfer the package to a bare machine with a GPU, and run tests and benchmarks there.
 
-`card.py stage FOLDER --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies and
-nerfstudio, except torch and numpy, and archives them in parts FOLDER/part.00, FOLDER/part.01, ... of limited size.
-`card.py run ORDER... --stage PART... --output RESULTS` unpacks them on the machine and runs the orders; each step has
-its own time limit."""
+`card.py stage FILE.tar --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies and
+nerfstudio, except torch and numpy, and archives them. `card.py run ORDER... --stage FILE.tar --output RESULTS` unpacks
+them on the machine and runs the orders; each step has its own time limit."""
 
 import argparse
 import os
@@ -40,8 +39,8 @@ class Step:
 
 
 def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (), length: int = 30_000) -> list[Step]:
-    """Build the steps of an order, with tables in `results`. `frames` draws scenes of `surfels` surfels and the bundles
-    of `train`, which trains on the captures in `data` for `length` steps."""
+    """Build the steps of an order, with tables in `results`. `frames` also draws the bundles of `train`, which trains
+    on the captures in `data` for `length` steps."""
     times = (sys.executable, "benchmarks/times.py")
     pytest = (sys.executable, "-m", "pytest", "-q", "-rfEs", "--tb=short", "-o", "faulthandler_timeout=60")
     sanitizer = ("compute-sanitizer", "--error-exitcode", "9", "--print-limit", "20", "--tool")
@@ -70,11 +69,9 @@ def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (),
 
 
 def stage(arguments: argparse.Namespace) -> None:
-    """Collect the wheels and LPIPS's weights and archive them in parts, see above."""
+    """Collect the wheels and LPIPS's weights in an archive."""
     kept = ROOT / "build" / f"card-{Path(arguments.python).name}"
     tools, wheels = kept / "tools", kept / "wheels"
-    if arguments.folder.exists():
-        sys.exit(f"{arguments.folder} exists: name a new folder, or remove it")
     shutil.rmtree(wheels, ignore_errors=True)  # of other versions
     wheels.mkdir(parents=True)
     if not tools.exists():
@@ -95,20 +92,13 @@ def stage(arguments: argparse.Namespace) -> None:
 
     lpips.load("alex")
     shutil.copy(lpips.weights_path("alex"), wheels)
-    archive(wheels, arguments.folder, arguments.megabytes)
+    subprocess.run(["tar", "-C", wheels, "-cf", arguments.archive.absolute(), "."], check=True)
 
 
-def archive(wheels: Path, folder: Path, megabytes: int) -> None:
-    """Write an archive of a folder in parts of at most so many megabytes."""
-    folder.mkdir(parents=True)
-    packed = subprocess.run(["tar", "-C", wheels, "-c", "."], capture_output=True, check=True).stdout
-    subprocess.run(["split", "-d", "-b", f"{megabytes}MB", "-", folder / "part."], input=packed, check=True)
-
-
-def unpack(staged: Sequence[Path], work: Path) -> dict[str, str]:
+def unpack(archive: Path, work: Path) -> dict[str, str]:
     """Install the wheels to a folder, copy the checkout with their compiled modules, and return the environment."""
-    site, packed = work / "site", b"".join(part.read_bytes() for part in sorted(staged, key=lambda part: part.name))
-    subprocess.run(["tar", "-C", work, "-x"], input=packed, check=True)
+    site = work / "site"
+    subprocess.run(["tar", "-C", work, "-xf", archive.absolute()], check=True)
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-compile", "--target"]
     subprocess.run([*command, site, *work.glob("*.whl")], check=True)
     tree = work / "tree"
@@ -140,7 +130,6 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
         return f"| {step.name} | not begun: no time left | |"
     command, text = [str(word) for word in step.command], logs / f"{step.name}.txt"
     limited = ["timeout", "--signal=KILL", str(limit), *command]  # with all its children
-    # unbuffered, so that logs are complete
     with tempfile.TemporaryDirectory() as folder, text.open("w") as log:
         environment = {**environment, "TMPDIR": folder, "PYTHONUNBUFFERED": "1"}
         print(*command, file=log, flush=True)
@@ -153,19 +142,18 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
 
 
 def main() -> int:
-    """Stage the wheels or run the orders, as the command line says; return the exit status."""
+    """Stage the wheels or run the orders; return the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )
     commands = parser.add_subparsers(dest="command", required=True)
-    staging = commands.add_parser("stage", help="make the folder of wheels")
-    staging.add_argument("folder", type=Path, help="must not exist")
+    staging = commands.add_parser("stage", help="make the archive of wheels")
+    staging.add_argument("archive", type=Path)
     staging.add_argument("--python", default=sys.executable, help="a Python of the machine's version (%(default)s)")
     staging.add_argument("--architectures", default="90", help="compute capabilities of its card (%(default)s)")
-    staging.add_argument("--megabytes", type=int, default=38, help="most of a part (%(default)s)")
     running = commands.add_parser("run", help="run orders on the machine")
     running.add_argument("orders", nargs="+", metavar="ORDER", choices=ORDERS, help=", ".join(ORDERS))
-    running.add_argument("--stage", type=Path, nargs="+", required=True, help="the parts")
+    running.add_argument("--stage", type=Path, required=True, help="the archive")
     running.add_argument("--data", type=Path, default=Path(), help="folder of the captures")
     running.add_argument("--output", type=Path, required=True)
     running.add_argument("--surfels", nargs="+", default=["50000", "150000", "500000"], help="scenes of the tables")

@@ -1,9 +1,8 @@
 #!/usr/bin/env python
-"""Compare quality, bytes, memory and time of a fixed small job with the committed baseline.
+"""Compare quality, bytes, memory and time of a fixed small job with the committed baseline, benchmarks/gate.json.
 
-Training is chaotic: rounding alone moves one seed's PSNR by up to 0.13 dB, so the mean over seeds and all photographs
-is compared. CPU seconds are divided by those of a calibration run in between, so that a busy or slower machine gives
-the same figures. `--accept` writes the figures to the baseline, benchmarks/gate.json."""
+Rounding alone moves one seed's PSNR by up to 0.13 dB, so means over seeds and all photographs are compared. CPU seconds
+are divided by those of a calibration run in between, so that a busy or slower machine gives the same figures."""
 
 import itertools
 import json
@@ -31,7 +30,7 @@ from bitymi_ns.bundle import read_bundle
 from bitymi_ns.files import write_file
 from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.machine import processor
-from bitymi_ns.measure.markdown import table
+from bitymi_ns.measure.markdown import number, table
 from bitymi_ns.measure.report.records import means
 from bitymi_ns.plugin.run import lpips
 from bitymi_ns.sample import generate
@@ -44,8 +43,7 @@ from bitymi_ns.train.losses import psnr
 
 BASELINE = Path(__file__).with_suffix(".json")
 THREADS = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "passive"}
-SETTINGS = {"steps": 320, "tuning": 20, "seeds": 4}
-"""The job: steps of training and of texel tuning, and number of seeds."""
+SETTINGS = {"steps": 320, "tuning": 20, "seeds": 4}  # steps of training and of texel tuning, number of seeds
 
 
 @dataclass(frozen=True)
@@ -73,13 +71,13 @@ LIMITS = {
     "frame": Limit("a baked frame, calibrations", "less", 0.15, digits=4, timed=True),
 }
 ELSEWHERE = 2.0  # factor of the limits on another processor model than the baseline's
-Scenes = dict[str, dict[str, float]]  # scene -> figure -> value
+Figures = dict[str, float]
 
 
 class Calibration:
-    """Fixed mixture of the operations of training (matrix product, sort, gather from 32 MB, chains of small tensors,
-    Python), run repeatedly while a part is timed, so that a slow machine slows both. No operation dominates: the gather
-    alone varies twice as much as training does when other programs share the caches."""
+    """Fixed mixture of the operations of training, run repeatedly while a part is timed, so that a slow machine slows
+    both. No operation dominates: the gather from 32 MB alone varies twice as much as training does when other programs
+    share the caches."""
 
     def __init__(self) -> None:
         generator = torch.Generator().manual_seed(0)
@@ -92,7 +90,7 @@ class Calibration:
         self.run()
         self.seconds.clear()  # warm-up
 
-    def run(self, *unused: Any) -> None:
+    def run(self) -> None:
         start = time.process_time()
         x = self._matrix
         for _ in range(4):
@@ -111,8 +109,8 @@ class Calibration:
         return lambda *_: self.run() if next(calls) % n == 0 else None
 
     def timed(self, work: Callable[[], Any]) -> tuple[Any, float]:
-        """Run `work`; return its result and its CPU time, as a multiple of the median calibration run during it (else
-        after it)."""
+        """Run `work`; return its result, and its CPU time in medians of the calibration runs during it (else after
+        it)."""
         self.seconds.clear()
         start = time.process_time()
         result = work()
@@ -122,8 +120,8 @@ class Calibration:
         return result, seconds / statistics.median(self.seconds)
 
 
-def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict[str, float]:
-    """Measure the figures of one scene and seed."""
+def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> Figures:
+    """Measure the figures of one seed."""
     config, background = TrainConfig(seed=seed), torch.zeros(3)
     views, cameras = [*capture.train, *capture.held_out], [view.camera for view in capture.train]
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
@@ -159,61 +157,53 @@ def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> dict
     }
 
 
-def run_job(data: Path, downscale: int) -> dict[str, float]:
-    """Measure the figures of one scene in this process: means over the seeds (minima of times), and peak memory."""
+def run_job(data: Path) -> Figures:
+    """Measure the figures in this process: means over the seeds (minima of times), and peak memory."""
     torch.set_num_threads(int(THREADS["OMP_NUM_THREADS"]))
-    calibration, capture = Calibration(), load_capture(data, downscale=downscale)
+    calibration, capture = Calibration(), load_capture(data)
     seeds = [run_seed(capture, seed, calibration) for seed in range(SETTINGS["seeds"])]
     # other programs only ever add time
-    found = means(seeds) | {key: min(f[key] for f in seeds) for key, limit in LIMITS.items() if limit.timed}
-    found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    found["psnr_spread"] = statistics.pstdev(figures["psnr_trained"] for figures in seeds)
-    found["calibration_seconds"] = statistics.median(calibration.seconds)
-    return found
+    figures = means(seeds) | {key: min(f[key] for f in seeds) for key, limit in LIMITS.items() if limit.timed}
+    figures["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    figures["psnr_spread"] = statistics.pstdev(seed["psnr_trained"] for seed in seeds)
+    figures["calibration_seconds"] = statistics.median(calibration.seconds)
+    return figures
 
 
-def measure(capture: Path | None) -> Scenes:
-    """Measure the room at 160 x 120, and a capture at half its size, each in a new process: peak memory is its own."""
+def measure() -> Figures:
+    """Measure the room at 160 x 120 in a new process, so that peak memory is its own."""
     os.environ |= THREADS  # read when torch loads OpenMP
-    found = {}
     with tempfile.TemporaryDirectory() as folder:
         room = generate(Path(folder) / "room", views=24, width=160, height=120, points=3000)
-        jobs: list[tuple[str, Path, int]] = [("room", room, 1)]
-        jobs += [] if capture is None else [(capture.name, capture.absolute(), 2)]
-        for name, data, downscale in jobs:
-            say(f"gate: {name}")
-            with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-                found[name] = process.submit(run_job, data, downscale).result()
-    return found
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+            return process.submit(run_job, room).result()
 
 
-def judge(found: Scenes, baseline: Scenes, same_cpu: bool) -> tuple[list[list[str]], list[str]]:
-    """Compare each figure with its baseline: a row of the table each, and the names of those that are worse. Not judged
-    are times on another processor model, and LPIPS without its weights."""
+def judge(figures: Figures, baseline: Figures, same_cpu: bool) -> tuple[list[list[str]], list[str]]:
+    """Compare the figures with the baseline: rows of the table, and the names of those that are worse. Not judged are
+    times on another processor model, and LPIPS without its weights."""
     rows, worse = [], []
-    for scene, figures in found.items():
-        for key, limit in LIMITS.items():
-            before, now = baseline.get(scene, {}).get(key), figures[key]
-            verdict, change = "new", ""
-            if before is not None:
-                change = f"{100 * (now / before - 1):+.1f} %" if limit.relative else f"{now - before:+.{limit.digits}f}"
-                allowed = limit.by * (abs(before) if limit.relative else 1.0) * (1.0 if same_cpu else ELSEWHERE)
-                verdict = "WORSE" if (now - before) * (-1 if limit.better == "more" else 1) > allowed else "ok"
-                if limit.timed and not same_cpu or math.isnan(now):
-                    verdict = "not judged"
-            if verdict == "WORSE":
-                worse.append(key)
-            shown = ["" if value is None else f"{value:,.{limit.digits}f}" for value in (before, now)]
-            may = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
-            rows.append([scene, limit.title, *shown, change, may, verdict])
+    for key, limit in LIMITS.items():
+        before, now = baseline.get(key), figures[key]
+        verdict, change = "new", ""
+        if before is not None:
+            change = f"{100 * (now / before - 1):+.1f} %" if limit.relative else f"{now - before:+.{limit.digits}f}"
+            allowed = limit.by * (abs(before) if limit.relative else 1.0) * (1.0 if same_cpu else ELSEWHERE)
+            verdict = "WORSE" if (now - before) * (-1 if limit.better == "more" else 1) > allowed else "ok"
+            if limit.timed and not same_cpu or math.isnan(now):
+                verdict = "not judged"
+        if verdict == "WORSE":
+            worse.append(key)
+        shown = [number(value, limit.digits) for value in (before, now)]
+        may = f"{100 * limit.by:g} %" if limit.relative else f"{limit.by:g}"
+        rows.append([limit.title, *shown, change, may, verdict])
     return rows, worse
 
 
-def main(capture: Path | None = None, accept: bool = False, baseline: Path = BASELINE) -> None:
-    """Measure the job and compare it with the baseline, or accept it as the baseline.
+def main(accept: bool = False, baseline: Path = BASELINE) -> None:
+    """Measure the job and compare it with the baseline.
 
     Args:
-        capture: An undistorted capture to run at half its size beside the room.
         accept: Make the figures the new baseline.
         baseline: File to compare with, or to write.
     """
@@ -222,29 +212,27 @@ def main(capture: Path | None = None, accept: bool = False, baseline: Path = BAS
     except lpips.LpipsUnavailable as error:
         say(f"gate: LPIPS is not judged: {error}")
         os.environ["BITYMI_NO_DOWNLOAD"] = "1"  # do not try again for every view
-    empty = {"settings": SETTINGS, "processor": processor(), "scenes": {}}
-    stored = json.loads(baseline.read_text("utf8")) if baseline.is_file() else empty
+    job = {"settings": SETTINGS, "processor": processor()}
+    stored = json.loads(baseline.read_text("utf8")) if baseline.is_file() else {**job, "figures": {}}
     if not accept and stored["settings"] != SETTINGS:
         raise SystemExit(f"gate: the baseline is of {stored['settings']}, not of {SETTINGS}")
-    figures = measure(capture)
+    figures = measure()
     same_cpu = stored["processor"] == processor()
-    rows, worse = judge(figures, stored["scenes"], same_cpu)
+    rows, worse = judge(figures, stored["figures"], same_cpu)
     if worse and all(LIMITS[key].timed for key in worse) and not accept:
         say("gate: slower than the baseline; timed once more, as the machine may have been busy")
-        again, timed = measure(capture), [key for key, limit in LIMITS.items() if limit.timed]
-        figures = {name: f | {key: min(f[key], again[name][key]) for key in timed} for name, f in figures.items()}
-        rows, worse = judge(figures, stored["scenes"], same_cpu)
-    print(table(("scene", "figure", "baseline", "now", "change", "may be worse by", ""), rows, (0, 1, 6)))
+        again = measure()
+        figures |= {key: min(figures[key], again[key]) for key, limit in LIMITS.items() if limit.timed}
+        rows, worse = judge(figures, stored["figures"], same_cpu)
+    print(table(("figure", "baseline", "now", "change", "may be worse by", ""), rows, (0, 5)))
     if not same_cpu:
         print(
             f"\nThe baseline is of {stored['processor']}, this is {processor()}: times are not judged, and the other "
             f"figures may be worse by {ELSEWHERE:g} times as much, because kernels round differently there."
         )
     if accept:
-        rounded = {name: {k: round(v, 5) for k, v in f.items() if not math.isnan(v)} for name, f in figures.items()}
-        # keep other captures' figures of the same job and processor model
-        kept = stored["scenes"] if {**stored, "scenes": {}} == empty else {}
-        text = json.dumps({**empty, "scenes": {**kept, **rounded}}, indent=2, sort_keys=True)
+        rounded = {name: round(value, 5) for name, value in figures.items() if not math.isnan(value)}
+        text = json.dumps({**job, "figures": rounded}, indent=2, sort_keys=True)
         write_file(baseline, (text + "\n").encode())
         print(f"\nThe new baseline is in {baseline}; commit it with the change that it belongs to.")
     elif worse:

@@ -1,12 +1,11 @@
 #!/usr/bin/env python
-"""Compare training options in long and short runs, without nerfstudio's commands: no default is
-chosen from short runs alone.
+"""Compare training options in long and short runs, without nerfstudio's commands.
 
     python benchmarks/long.py DATA... --rows bitymi "bitymi train.texels.mean_rates=0.2" --runs 10000/4 1500/2 300/1
 
 A run is STEPS/REDUCTION: number of steps, and integer factor by which photographs are downscaled. A long one takes 25
-to 60 minutes on one CPU core, or one to two on a GPU (--device cuda). Several commands with the same --work share the
-runs, which `bitymi report WORK` plots. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
+to 60 minutes on one CPU core, or one to two on a GPU. Several commands with the same --work share the runs, which
+`bitymi report WORK` plots. Rounding alone moves PSNR by 0.1 dB: give --seeds."""
 
 import contextlib
 import functools
@@ -56,8 +55,6 @@ Figures = dict[str, dict[str, Any]]
 
 @dataclass
 class Options:
-    """Options of the command line."""
-
     data: tyro.conf.Positional[tuple[Path, ...]]  # Folders with a transforms.json, or such files.
     rows: tuple[str, ...] = ("bitymi",)  # A method each, and its settings: PATH=VALUE ...
     runs: tuple[str, ...] = ("10000/4", "1500/2", "300/1")  # STEPS/REDUCTION each.
@@ -74,7 +71,7 @@ class Options:
 
 @dataclass(frozen=True)
 class LongRun:
-    """One training run, with the options of the command line."""
+    """A training run."""
 
     data: Path
     row: str
@@ -88,11 +85,11 @@ class LongRun:
 
     @property
     def scene(self) -> str:
-        """Name in tables: a capture with a length and a size is a scene."""
+        """Name in tables."""
         return f"{self.data.resolve().name}, {self.steps:,} steps at 1/{self.reduction}"
 
     def key(self, cell: str = "eval") -> dict[str, Any]:
-        """Build the key of one of the `Figures`, with all settings that affect them."""
+        """Build the key of one of the `Figures`."""
         kind, _, bundle = cell.partition(" ")
         key = {"cell": kind, "row": self.row, "scene": self.scene, "settings": self.row, "steps": self.steps}
         key |= {name: getattr(self.options, name) for name in ("photographs", "bake", "align", "megabytes")}
@@ -120,7 +117,7 @@ def preset_of(row: str) -> Preset:
 
 
 def quality(draw: Callable[[Camera], Any], views: Sequence[View], background: Tensor | None) -> dict[str, float]:
-    """Compare renders with photographs: means over views on the device of `draw`."""
+    """Compare renders with photographs: means over views."""
     rows = []
     for view in views:
         with torch.no_grad():
@@ -131,7 +128,7 @@ def quality(draw: Callable[[Camera], Any], views: Sequence[View], background: Te
 
 
 def peak_bytes(device: torch.device) -> float:
-    """Read the most memory since the last call: a GPU's tensors, or the whole process on a CPU."""
+    """Read the peak memory since the last call: a GPU's tensors, or the whole process on a CPU."""
     if device.type == "cuda":
         most = torch.cuda.max_memory_allocated(device)
         torch.cuda.reset_peak_memory_stats(device)
@@ -182,7 +179,7 @@ def measure(run: LongRun) -> Figures:
     if aligned or exposure.table is not None:
         judged = evaluate(scene, capture.held_out, preset.train, poses if aligned else None, exposure)
         results |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "mean_exposure_psnr")}
-    found: Figures = {"train": costs | {"steps": run.steps, "rollbacks": training.guard.rollbacks}}
+    figures: Figures = {"train": costs | {"steps": run.steps, "rollbacks": training.guard.rollbacks}}
     views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
     views = corrected(views, exposure.state_dict(), [view.file for view in views if view.file])
     name = "-".join((run.data.stem, *shlex.split(run.row), f"{run.steps}-{run.seed}"))
@@ -196,9 +193,9 @@ def measure(run: LongRun) -> Figures:
             written = sum(file.stat().st_size for file in path.iterdir())
             baked = read_bundle(path).scene.to(device)
         drawn = quality(lambda camera, baked=baked: baked.render(camera.to(device), background), held_out, background)
-        found[f"export {form}"] = {"bytes": written, "seconds": seconds}
-        found[f"eval {form}"] = {"results": drawn | {"surfels": len(baked.surfels["means"])}}
-    return found | {"eval": {"results": results}}  # the last cell: the run is complete
+        figures[f"export {form}"] = {"bytes": written, "seconds": seconds}
+        figures[f"eval {form}"] = {"results": drawn | {"surfels": len(baked.surfels["means"])}}
+    return figures | {"eval": {"results": results}}  # the last cell: the run is complete
 
 
 def main(options: Options) -> None:
@@ -209,7 +206,7 @@ def main(options: Options) -> None:
         for data, run, row, seed in itertools.product(options.data, options.runs, options.rows, options.seeds)
     ]
     for row in options.rows:
-        preset_of(row)
+        preset_of(row)  # raises before hours of training
     options.work.mkdir(parents=True, exist_ok=True)
     cells = Cells(options.work / FILE)
     for i, run in enumerate(runs):
@@ -219,17 +216,16 @@ def main(options: Options) -> None:
                 continue
             say(f"{i + 1} of {len(runs)}: {run}")
             start = time.perf_counter()
-            found = measure(run)
+            figures = measure(run)
             made = provenance(sys.argv, time.perf_counter() - start)
-            for name, value in found.items():
+            for name, value in figures.items():
                 cells.add(run.key(name), value, made)
-            said = finite_numbers({**found["train"], **found["eval"]["results"]})
+            said = finite_numbers({**figures["train"], **figures["eval"]["results"]})
             say(", ".join(f"{name} {figure:.4g}" for name, figure in said.items()))
     cells.refresh()
     records, own = Records(), {identity(run.key(), "cell") for run in runs}
-    add_cells(
-        (cell for cell in cells.known.values() if identity(cell["key"], "cell", "bundle") in own), cells.path, records
-    )
+    finished = [cell for cell in cells.known.values() if identity(cell["key"], "cell", "bundle") in own]
+    add_cells(finished, cells.path, records)
     publish(page("Long and short runs", quality_markdown(over_seeds(records.evaluations))), options.output)
 
 

@@ -1,4 +1,4 @@
-"""Make scenes like trained ones and cameras around bundles, and read captures without nerfstudio."""
+"""Scenes like trained ones, cameras around bundles, and captures read without nerfstudio."""
 
 import math
 from dataclasses import dataclass, replace
@@ -24,7 +24,6 @@ from bitymi_ns.train.texels import blank_texels
 from bitymi_ns.train.views import View
 
 SITES = 7
-LOG2_TABLE = 17
 CROSSING = 0.016  # share of the surfels that cross the camera's plane out of view
 PIXEL_SCALE = 0.9  # median scale of a surfel, relative to the side of its share of the image
 
@@ -34,8 +33,7 @@ def trained_like(n: int, width: int, height: int, device: torch.device, texture:
 
     Fitted to scenes of 17,000 to 22,000 surfels after 1,200 steps on three captures: ln(s_u / s_v) is normal with
     standard deviation 0.85, the mean log scale in pixels has 0.7, opacity and kernel exponent are logistic-normal
-    (medians 0.45 and 2.4); about 23 fragments are blended per pixel for any n. A fifth of the surfels lies outside the
-    view; a share `CROSSING` are discs beside the camera that cross its plane.
+    (medians 0.45 and 2.4); about 23 fragments are blended per pixel for any n. A fifth of the surfels is out of view.
     """
     g = torch.Generator().manual_seed(0)
     normal, uniform = partial(torch.randn, generator=g), partial(torch.rand, generator=g)
@@ -55,8 +53,8 @@ def trained_like(n: int, width: int, height: int, device: torch.device, texture:
         "opacity_logits": 1.3 * normal(n) - 0.2,
         "beta_raw": normal(n) + 0.45,
     }
-    # Beside the camera: statistics of a trained room of 12,900 surfels, with a median depth of 0.09 times that of the
-    # others, 12 depths off the axis, the larger scale 0.9 depths and three times the smaller.
+    # Discs that cross the camera's plane, as in a trained room: at 0.09 times the median depth of the others, 12 depths
+    # off the axis, the larger scale 0.9 depths and three times the smaller.
     beside = slice(n - round(CROSSING * n), n)
     z = 0.35 * torch.exp(0.3 * normal(round(CROSSING * n))).clamp(min=0.75)  # behind `near`
     lateral = 12 * torch.exp(0.8 * normal(len(z))).clamp(min=0.25)
@@ -71,7 +69,7 @@ def trained_like(n: int, width: int, height: int, device: torch.device, texture:
     config = SceneConfig(view_color="sv", sv_sites=SITES, texture="hash" if texture else "none", near=0.2)
     field = None
     if texture:
-        field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, LOG2_TABLE, g)
+        field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, 17, g)
         with torch.no_grad():
             field.field_w3.copy_(0.1 * normal(*field.field_w3.shape))  # starts at zero
     scene = Scene(config, surfels, field).to(device)
@@ -79,7 +77,7 @@ def trained_like(n: int, width: int, height: int, device: torch.device, texture:
 
 
 def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[Scene, Camera]:
-    """Generate `trained_like` with a tile per surfel at the camera's resolution, and random texels."""
+    """Generate `trained_like` with a tile of random texels per surfel, at the camera's resolution."""
     scene, camera = trained_like(n, width, height, device, texture=False)
     scene.config.texture = "texels"
     field = blank_texels(scene, [View(camera, torch.zeros(height, width, 3, device=device))], 1, TexelConfig())
@@ -111,7 +109,7 @@ def textured(n: int, width: int, height: int, device: torch.device) -> tuple[Bak
 
 
 def around(bundle: Bundle, width: int, height: int) -> list[Camera]:
-    """Build three cameras around the centre of a bundle, at the scale of training (cameras in the unit ball)."""
+    """Build three cameras around the centre of a bundle, whose training cameras were in the unit ball."""
     middle = bundle.scene.surfels["means"].median(dim=0).values.double().numpy()
     K = torch.tensor([[0.8 * width, 0, width / 2], [0, 0.8 * width, height / 2], [0, 0, 1]])
     cameras = []
@@ -135,15 +133,8 @@ class SplitCapture:
 
 def load_capture(path: Path, downscale: int = 1) -> SplitCapture:
     """Read a capture, translated and scaled as in nerfstudio: the mean of the cameras is the origin, and their largest
-    coordinate is 1. The orientation is kept.
-
-    Args:
-        path: a folder or file, see `bitymi_ns.load_capture`; Blender's get their points from the first *_pc.ply.
-        downscale: integer factor by which photographs are downscaled.
-
-    Raises:
-        CaptureError: it cannot be read.
-    """
+    coordinate is 1. `path`: as for `bitymi_ns.load_capture`; Blender's get their points from the first *_pc.ply.
+    `downscale`: integer factor by which photographs are downscaled. Raises CaptureError."""
     blender = (path / "transforms_train.json").exists()
     cloud = next(iter(sorted(path.glob("*_pc.ply"))), None) if blender else None
     given = {} if cloud is None else {"ply_path": cloud.absolute()}

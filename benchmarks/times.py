@@ -4,7 +4,6 @@
 import math
 import os
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -23,8 +22,7 @@ from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
 from bitymi_ns.bundle import read_bundle
-from bitymi_ns.measure.bench.cli import BenchRun
-from bitymi_ns.measure.bench.process import BenchError, say
+from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.markdown import number, page, publish, table
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.baked_renderer import BakedRenderer, Stage
@@ -35,7 +33,6 @@ from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import HashField, TexelField
 
 CPU = torch.device("cpu")
-TILE_SIDE = 8
 CLOCK = 2.0e9  # upper bound of GPU clocks, Hz, to convert seconds to cycles of `torch.cuda._sleep`
 TIMED = ("list", "draw", "frame", "graph", "packed")
 HEADER = ("scene", "size", "million pairs", "fragments/pixel", *(f"{name} ms" for name in TIMED), "frames/s")
@@ -62,7 +59,7 @@ def seconds(run: Run, runs: int, warm_up: int = 2) -> tuple[float, float]:
 
 def device_milliseconds(run: Run, runs: int) -> float:
     """Measure the median time of a call on the GPU, after ten untimed ones. Calls are queued behind a spin of the
-    device that outlasts the queueing, so that launches are not measured. Synchronisations within a call are."""
+    device that outlasts the queueing, so that launches are not measured."""
     for _ in range(10):
         run()
     torch.cuda.synchronize()
@@ -92,7 +89,7 @@ def back(outputs: Tensor, inputs: Sequence[Tensor]) -> Run:
 
 
 def cases(n: int, width: int, height: int) -> tuple[str, dict[str, Run]]:
-    """Describe a scene's counts, and prepare its kernels by name; backward passes run on a retained graph."""
+    """Describe a scene's counts, and prepare its kernels by name."""
     scene, camera = trained_like(n, width, height, CPU)
     baked, _ = textured(n, width, height, CPU)
     q, field, bound = scene.surfels, scene.field, scene.config.weight_bound
@@ -110,7 +107,7 @@ def cases(n: int, width: int, height: int) -> tuple[str, dict[str, Run]]:
     weight, uv = (values.detach().requires_grad_() for values in (fragments.weight, fragments.uv))
     alone = replace(fragments, weight=weight, uv=uv, depth=fragments.depth.detach())
     blend = partial(ops.blended_image, alone, replace(projection, geom=geom), leaf, bound=bound)
-    side = torch.full((n, 2), TILE_SIDE, dtype=torch.int32)
+    side = torch.full((n, 2), 8, dtype=torch.int32)
     tiles = ops.TexelTiles.of_sizes(side, projection.geom.new_full((n,), SUPPORT))
     texels = (torch.rand(tiles.count, 3) - 0.5).requires_grad_()
     photo, other = (torch.rand(height, width, 3) for _ in range(2))
@@ -150,9 +147,8 @@ def kernels(
     runs: int = 9,
     output: Path | None = None,
 ) -> None:
-    """Time each CPU kernel on a scene like a trained one (`scenes.trained_like`), through `bitymi_ns.ops` as in
-    training and rendering: medians after two warm-up runs. The baked scene has a uint8 atlas, a tile per surfel, a
-    texel per pixel.
+    """Time each CPU kernel on a scene like a trained one (`scenes.trained_like`): medians after two warm-up runs. The
+    baked scene has a tile per surfel and a texel per pixel.
 
     Args:
         surfels: Sizes of the scene.
@@ -169,17 +165,14 @@ def kernels(
             say(f"{n:,} surfels, {name}: {1e3 * wall:.2f} ms")
             rows.append([name, number(1e3 * wall), number(1e3 * cpu)])
         parts += [f"### {n:,} surfels at {size[0]} x {size[1]}", counts, table(("kernel", "ms", "CPU ms"), rows)]
-    note = (
-        f"Median of {runs} runs; {torch.get_num_threads()} threads. Load average at the start: {load:.1f}: other "
-        "work on the machine spoils ms, CPU ms hardly."
-    )
+    note = f"Median of {runs} runs; {torch.get_num_threads()} threads. Load average at the start: {load:.1f}."
     publish(page("CPU kernels", "\n\n".join(parts), [note]), output)
 
 
 def frame_row(
     name: str, scene: BakedScene, cameras: Sequence[Camera], milliseconds: Callable[[Run], float]
 ) -> list[str]:
-    """Measure the cells of HEADER, means over cameras of one size. `milliseconds`: times a call."""
+    """Measure the cells of HEADER, means over cameras of one size."""
     width, height = size = (cameras[0].width, cameras[0].height)
     graph = scene.tiles.is_cuda
     sums = dict.fromkeys(("pairs", "fragments", *TIMED), 0.0)
@@ -210,18 +203,15 @@ def frames(
     emulated: bool = False,
     output: Path | None = None,
 ) -> None:
-    """Time frames of baked scenes on a GPU and print a table.
-
-    Scenes: those of `scenes.textured`, and bundles with three cameras around their centre. "list" and "draw" are the
-    two stages of a frame, "frame" is both launched by the host, "graph" the same as a CUDA graph, "packed" that with 8
-    bits per channel instead of floats.
+    """Time frames of baked scenes on a GPU. "list" and "draw" are the two stages of a frame, "frame" is both launched
+    by the host, "graph" the same as a CUDA graph, "packed" that with 8 bits per channel instead of floats.
 
     Args:
-        surfels: Sizes of the scenes.
+        surfels: Sizes of the synthetic scenes (`scenes.textured`).
         sizes: Widths and heights of the images.
-        bundles: Baked scenes to draw as well.
+        bundles: Bundles to draw as well, from three cameras around their centre.
         runs: Timed frames, after ten untimed ones.
-        emulated: Try the script without a GPU: the kernels' host emulation on a tiny scene, whose times mean nothing.
+        emulated: Try the script without a GPU, by the kernels' host emulation, whose times mean nothing.
         output: Also write the Markdown to this file.
     """
     if emulated:
@@ -254,7 +244,7 @@ def frames(
 
 
 def baked(n: int, width: int, height: int, device: torch.device) -> Run:
-    """Prepare a frame with a BC7 atlas."""
+    """Prepare a frame of a baked scene."""
     scene, camera = textured(n, width, height, device)
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
@@ -320,24 +310,5 @@ def cuda(
             print(profile.key_averages().table("self_device_time_total", row_limit=45, max_name_column_width=90))
 
 
-def nerfstudio(
-    data: tyro.conf.Positional[Path], steps: int = 3000, extra: str = "", work: Path = Path("outputs/times")
-) -> int:
-    """Run nerfstudio's commands on a capture, with the cells of `bitymi bench`: train, evaluate, export to BC7,
-    evaluate the bundle; tabulate quality, seconds and memory.
-
-    Args:
-        data: Folder of a capture.
-        steps: Length of the run.
-        extra: Further options of ns-train, as one word: --extra="--mixed-precision False".
-        work: Folder of runs, bundles, logs and finished cells.
-    """
-    try:
-        return BenchRun((data,), steps=steps, extra=extra, formats=("bc7",), work=work).run()
-    except BenchError as error:
-        raise SystemExit(f"times.py: {error}") from error
-
-
 if __name__ == "__main__":
-    commands = {"kernels": kernels, "frames": frames, "cuda": cuda, "nerfstudio": nerfstudio}
-    sys.exit(tyro.extras.subcommand_cli_from_dict(commands, description=__doc__))
+    tyro.extras.subcommand_cli_from_dict({"kernels": kernels, "frames": frames, "cuda": cuda}, description=__doc__)

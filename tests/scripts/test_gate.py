@@ -22,7 +22,7 @@ GOOD = {
 
 def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *measured: Any, accept: bool = False) -> int:
     """Run the gate on given measurements; returns how many it used."""
-    left = [{"room": {**GOOD, **change}} for change in measured]
+    left = [{**GOOD, **change} for change in measured]
     monkeypatch.setattr(gate, "measure", lambda *_: left.pop(0))
     gate.main(baseline=baseline, accept=accept)
     return len(measured) - len(left)
@@ -31,7 +31,7 @@ def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *meas
 def test_equal_and_better_pass(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     baseline = tmp_path / "gate.json"
     run(gate, monkeypatch, baseline, {}, accept=True)
-    assert json.loads(baseline.read_text())["scenes"]["room"]["psnr_trained"] == 20.0
+    assert json.loads(baseline.read_text())["figures"]["psnr_trained"] == 20.0
     assert run(gate, monkeypatch, baseline, {}) == 1
     assert run(gate, monkeypatch, baseline, {"psnr_trained": 25.0, "bundle_bytes": 10.0, "train": 1.0}) == 1
 

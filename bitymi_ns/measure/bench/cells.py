@@ -1,5 +1,5 @@
-"""Store of finished cells: JSON lines of `key` (all settings that affect the result), `value` (the figures; paths are
-relative to the work folder) and `made` (time, machine, versions, command)."""
+"""Finished cells as JSON lines: `key` (all settings that affect the result), `value` (the figures; paths are relative
+to the work folder) and `made` (time, machine, versions, command)."""
 
 import datetime
 import fcntl
@@ -21,7 +21,7 @@ NOT_OF_A_RUN = ("cell", "bundle", "export")  # entries of a key in which the cel
 
 
 def identity(key: dict[str, Any], *without: str) -> str:
-    """Serialise the identity of a cell, ignoring the entries `without`."""
+    """Serialise the identity of a cell, without some entries."""
     return json.dumps({name: value for name, value in key.items() if name not in (*NAMES, *without)}, sort_keys=True)
 
 
@@ -58,18 +58,16 @@ class Cells:
                 cell = json_of(line)
                 self.known[identity(cell["key"])] = {**cell, "value": dict(cell["value"])}
             except (ValueError, KeyError, TypeError, AttributeError) as error:
-                raise BenchError(
-                    f"{self.path}, line {number}, is not a finished cell ({error}): remove that line, or give another "
-                    "--work"
-                ) from error
+                reason = f"{self.path}, line {number}, is not a finished cell ({error})"
+                raise BenchError(f"{reason}: remove that line, or give another --work") from error
 
     def get(self, key: dict[str, Any]) -> dict[str, Any] | None:
         """Return a finished cell, or None."""
         return self.known.get(identity(key))
 
     def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:
-        """Append a cell, after removing a truncated last line; NaN and infinite numbers, which JSON cannot hold, become
-        None. Raises BenchError: the file cannot be written."""
+        """Append a cell, after removing a truncated last line; NaN and infinite numbers become None. Raises BenchError:
+        the file cannot be written."""
         cell = {"key": key, "value": value, "made": origin}
         cell = json.loads(json.dumps(cell), parse_constant=lambda constant: None)
         line = json.dumps(cell).encode("utf8") + b"\n"

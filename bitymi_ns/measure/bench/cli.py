@@ -17,7 +17,7 @@ from bitymi_ns.measure.report.tables import NOTES, quality_markdown
 from bitymi_ns.trust import printable
 from .cells import FILE, Cells
 from .engine import run_chains
-from .matrix import Chain, Format, Plan, Row, chains, local_scenes, read_plan, standard_scenes
+from .matrix import Chain, Format, PlanName, Row, chains, local_scenes, read_plan, standard_scenes
 from .process import BenchError, say
 
 FAILED, INTERRUPTED = 1, 130  # exit statuses after a failed cell and after Ctrl-C
@@ -30,29 +30,27 @@ class BenchRun:
     data: tuple[Path, ...]  # local: folders of captures. A standard data set: the folder of its scenes.
     scenes: tuple[str, ...] = ()  # Only these scenes of a standard data set.
     methods: tuple[str, ...] = ("bitymi",)  # Methods of ns-train.
-    plan: str | None = None
-    """Rows to train instead of --methods: ablation, atlas, overdraw, rate, resolution, or a plan's YAML file."""
+    plan: PlanName | None = None  # Rows to train, and bundles to bake, instead of --methods and --formats.
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
     seeds: tuple[int, ...] = ()  # Train once per seed; none = once, with the method's own.
     steps: int | None = None  # Steps of a training; schedules scale with it. None = the method's own.
     formats: tuple[Format, ...] = get_args(Format)  # Bundle formats to bake each trained scene to; none = no baking.
     work: Path = Path("outputs/bench")
-    """Folder of runs, bundles, logs and finished cells, which are not run again. Several processes may share the
-    folder, on different GPUs or machines: each takes runs that no other is working on."""
+    """Folder of runs, bundles, logs and finished cells, which are not run again. Processes on different GPUs or
+    machines may share it: each takes runs that no other is working on."""
     output: Path | None = None  # Also write the table to this Markdown file.
     suite: tyro.conf.Suppress[str] = "local"
 
     def chains(self) -> list[Chain]:
-        """List the cells of each run of these options. Raises BenchError: an option is invalid; the message says
-        which."""
+        """List the cells of each run of these options. Raises BenchError: an option is invalid."""
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
-        own = {name: Row.model_construct(method=name, options=[]) for name in self.methods}
-        plan = read_plan(self.plan) if self.plan else Plan.model_construct(rows=own, bundles=None)
-        for row in plan.rows.values():
-            row.options += shlex.split(self.extra)
-        bundles = {name: ("--format", name) for name in self.formats} if plan.bundles is None else plan.bundles
+        rows, bundles = {name: Row(name) for name in self.methods}, {name: ["--format", name] for name in self.formats}
+        if self.plan:
+            rows, bundles = read_plan(self.plan)
+        extra = shlex.split(self.extra)
+        rows = {name: Row(row.method, (*row.options, *extra)) for name, row in rows.items()}
         if self.suite != "local":
             if len(self.data) != 1:
                 raise BenchError(f"--data is one folder: the one that holds the scenes of {self.suite}")
@@ -61,7 +59,7 @@ class BenchRun:
             raise BenchError("--scenes chooses scenes of a standard data set; name your captures with --data")
         else:
             scenes = local_scenes(self.data)
-        return chains(scenes, plan.rows, bundles, self.seeds, self.steps)
+        return chains(scenes, rows, bundles, self.seeds, self.steps)
 
     def run(self) -> int:
         """Run the missing cells, print the table, and return the exit status."""

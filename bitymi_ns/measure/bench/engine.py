@@ -1,5 +1,4 @@
-"""Execution of a benchmark matrix's missing cells. Several processes, on different GPUs or machines, may share a
-folder: runs locked by another process are skipped."""
+"""Execution of the missing cells of a benchmark matrix, except of runs that another process has locked."""
 
 import shutil
 import time
@@ -44,16 +43,15 @@ def command_of(work: Path, cell: Cell) -> list[str]:
 
 
 def read_result(work: Path, cell: Cell) -> dict[str, Any]:
-    """Read the figures of a finished command.
+    """Read the figures of a finished command. Raises CommandFailed: there are no readable ones.
 
-    train: `steps`, `seconds` and `cpu_seconds` of the training steps only (no loading, evaluation or saving),
-    `surfels`, `fragments`, `curve`. export: `bytes`, `files`, `format` and `statistics` of the bundle. eval:
-    nerfstudio's `results`, means over the held-out views, and the folder of their `pictures`. Raises CommandFailed:
-    there are no readable figures."""
+    train: `steps`, `seconds` and `cpu_seconds` of the training steps alone, `surfels`, `fragments`, `curve`. export:
+    `bytes`, `files`, `format` and `statistics` of the bundle. eval: `results`, means over the held-out views, and the
+    folder of their `pictures`."""
     output = work / cell.output
     with reading(output, _refuse):
         if cell.cell == "export":
-            from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch, not needed for others
+            from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch
 
             info = read_manifest(output)
             compact = info.surfels.columns is not None
@@ -82,7 +80,7 @@ def _refuse(message: str, cause: BaseException) -> NoReturn:
 
 
 def missing(chain: Chain, cells: Cells) -> list[Cell]:
-    """List the cells of a run to execute: those not finished, and those that depend on these."""
+    """List the cells of a run that are not finished, and those that depend on these."""
     pending: list[Cell] = []
     for cell in chain:
         if cells.get(cell.key) is None or cell.parent in pending:
@@ -102,8 +100,8 @@ def _run_cell(work: Path, cell: Cell, cells: Cells, lock: Lock) -> None:
 
 
 def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
-    """Execute the missing cells of all runs, except those that depend on a failed one. Returns a message for each
-    failed cell and each run locked by another process. Raises BenchError: there is nothing to run."""
+    """Execute the missing cells, except those that depend on a failed one. Returns a message for each failed cell and
+    each run locked by another process. Raises BenchError: there is nothing to run."""
     if not any(chains):
         raise BenchError("nothing to run: there is no scene, or no method")
     cells, total, failures = Cells(work / FILE), sum(map(len, chains)), []

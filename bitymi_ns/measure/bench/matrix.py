@@ -4,23 +4,21 @@ import hashlib
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, NoReturn
+from typing import Any, Literal, NamedTuple
 
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bitymi_ns.capture.recognise import recognise
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.presets import preset_names
-from bitymi_ns.ranges import describe_problems
-from bitymi_ns.safe_reading import read_text, reading
 from .cells import NOT_OF_A_RUN, identity
 from .process import BenchError
 
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._+-]*$")]
 Format = Literal["fp16", "uint8", "bc7", "compact"]  # of `ns-export bitymi-atlas`
+PlanName = Literal["ablation", "overdraw", "resolution", "atlas", "rate"]  # in plans.yaml
 
 
 @dataclass(frozen=True)
@@ -33,26 +31,17 @@ class Scene:
     parser: tuple[str, ...] = ()  # nerfstudio's dataparser and its options; empty: the method's own
 
 
-class Row(BaseModel):
+class Row(NamedTuple):
     """A method of nerfstudio with further options of ns-train."""
 
-    model_config = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
-    method: Name
-    options: list[str] = []
-
-
-class Plan(BaseModel):
-    """Rows to train by name, and bundles to bake: named options of `ns-export bitymi-atlas`; None: not stated."""
-
-    model_config = ConfigDict(extra="forbid", coerce_numbers_to_str=True)
-    rows: Annotated[dict[str, Row], Field(min_length=1)]
-    bundles: dict[Name, list[str]] | None = None
+    method: str
+    options: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Cell(Scene):
-    """A cell of the matrix: a training run, or an evaluation or export of its scene or of a bundle. Its fields are all
-    settings that affect its result."""
+    """A training, or an evaluation or export of its scene or bundle. The fields are all settings that affect the
+    result."""
 
     row: str = ""
     method: str = ""
@@ -88,7 +77,7 @@ class Cell(Scene):
 
     @property
     def output(self) -> Path:
-        """Path in the work folder of the output: a folder, or the file of an evaluation, beside the folder of its
+        """Path in the work folder of the output: a folder, or an evaluation's file, beside the folder of its
         pictures."""
         folders = {"train": Path("runs", self.folder), "export": Path("bundles", self.folder, self.form)}
         return folders.get(self.cell, Path("evals", self.folder, f"{self.form}.json"))
@@ -124,7 +113,7 @@ def chains(
     (empty: once, with the method's own), then baked to each bundle."""
     listed: list[Chain] = []
     for scene, (name, row), seed in product(scenes, rows.items(), list(seeds) or [None]):
-        train = Cell(**vars(scene), row=name, method=row.method, options=tuple(row.options), seed=seed, steps=steps)
+        train = Cell(**vars(scene), row=name, method=row.method, options=row.options, seed=seed, steps=steps)
         listed.append([train, replace(train, cell="eval")])
         for bundle, options in bundles.items() if train.ours else ():
             export = replace(train, cell="export", bundle=bundle, export=tuple(options))
@@ -132,25 +121,26 @@ def chains(
     return listed
 
 
-def _read(path: Path) -> Any:
-    with reading(path, _refuse):
-        try:
-            return yaml.safe_load(read_text(path))
-        except yaml.YAMLError as error:
-            raise ValueError(" ".join(str(error).split())) from error
-
-
-def _refuse(message: str, cause: BaseException) -> NoReturn:
-    raise BenchError(message) from cause
+@cache
+def _read(name: str) -> Any:
+    """Read a YAML file of this folder."""
+    return yaml.safe_load(Path(__file__).with_name(name).read_text("utf8"))
 
 
 def suites() -> dict[str, dict[str, Any]]:
-    """Read the standard data sets, by name; suites.yaml says what their entries are."""
-    return _read(Path(__file__).with_name("suites.yaml"))
+    """Read the standard data sets by name; suites.yaml says what their entries are."""
+    return _read("suites.yaml")
+
+
+def read_plan(name: PlanName) -> tuple[dict[str, Row], dict[str, list[str]]]:
+    """Read a plan: rows to train and bundles to bake (options of `ns-export bitymi-atlas`), by name."""
+    plan = _read("plans.yaml")[name]
+    rows = {title: Row(row["method"], tuple(row.get("options", ()))) for title, row in plan["rows"].items()}
+    return rows, plan["bundles"]
 
 
 def local_scenes(folders: Sequence[Path]) -> list[Scene]:
-    """List captures in any format that `ns-train bitymi --data` accepts. A Blender data set uses the points of its
+    """List captures in any format that `ns-train bitymi --data` reads. A Blender data set uses the points of its
     `hull_pc.ply`, if any. Raises BenchError: a folder is not a capture, two have the same name, or there is none."""
     if not folders:
         raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')
@@ -173,8 +163,7 @@ def local_scenes(folders: Sequence[Path]) -> list[Scene]:
 
 
 def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[Scene]:
-    """List the scenes of a standard data set. Raises BenchError: a scene does not exist, or its folder lacks required
-    files."""
+    """List the scenes of a standard data set. Raises BenchError: a scene does not exist, or its folder lacks files."""
     suite, scenes = suites()[name], []
     unknown = sorted(set(only) - set(suite["scenes"]))
     if unknown:
@@ -186,26 +175,7 @@ def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[Sce
         if missing:
             raise BenchError(
                 f"{folder} is not {suite['title']}'s {scene}: there is no {' and no '.join(missing)}. --data is the "
-                f"folder that holds the scenes; --scenes {scene} ... chooses some of them"
+                "folder that holds the scenes; --scenes chooses some of them"
             )
         scenes.append(Scene(scene, str(folder), name, tuple(suite["parser"].format(factor=factor).split())))
     return scenes
-
-
-def read_plan(name: str) -> Plan:
-    """Read a plan by name, or from a YAML file. Raises BenchError: the plan does not exist or is malformed; the message
-    says where."""
-    if name.endswith((".yaml", ".yml")):
-        entry = _read(Path(os.path.expanduser(name)))
-    else:
-        plans = _read(Path(__file__).with_name("plans.yaml"))
-        if name not in plans:
-            raise BenchError(f"there is no plan {name}: give {', '.join(plans)}, or a file that ends in .yaml")
-        entry = plans[name]
-    try:
-        return Plan.model_validate(entry)
-    except ValidationError as error:
-        raise BenchError(
-            f"plan {name}: {describe_problems(error)}; a plan has rows, NAME: {{method: NAME, options: [...]}}, and "
-            "optionally bundles, NAME: [options of ns-export bitymi-atlas]"
-        ) from error

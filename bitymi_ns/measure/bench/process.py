@@ -26,19 +26,10 @@ class CommandFailed(BenchError):
 
 
 def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) -> dict[str, float]:
-    """Run a command with its output in a file; an interrupt terminates the command first.
+    """Run a command with its output in a file; return `process_seconds`, `process_cpu_seconds` and `peak_bytes` of it
+    with all threads and children. An interrupt terminates the command first. Raises CommandFailed.
 
-    OpenMP threads wait without spinning, so that CPU seconds measure work.
-
-    Args:
-        lock: inherited by the command and labelled with its process, so that it stays locked if only this process is
-            killed.
-
-    Returns:
-        `process_seconds`, `process_cpu_seconds` and `peak_bytes` of the command with all threads and children.
-
-    Raises:
-        CommandFailed: non-zero exit status, or the command cannot be started.
+    `lock`: inherited by the command and labelled with its process, so that it stays locked if this process is killed.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
@@ -46,7 +37,7 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
         try:
             process = subprocess.Popen(
                 command,
-                env={**os.environ, "OMP_WAIT_POLICY": "passive"},
+                env={**os.environ, "OMP_WAIT_POLICY": "passive"},  # CPU seconds measure work, not spinning
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
@@ -69,9 +60,8 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode != 0:
         tail = "\n".join(log.read_text("utf8", "replace").splitlines()[-TAIL:])
-        raise CommandFailed(
-            f"{shlex.join(command)} ended with status {process.returncode}; see {log}, whose end is:\n{tail}"
-        )
+        ended = f"{shlex.join(command)} ended with status {process.returncode}"
+        raise CommandFailed(f"{ended}; see {log}, whose end is:\n{tail}")
     kibibytes = usage.ru_maxrss if sys.platform != "darwin" else usage.ru_maxrss / 1024
     return {
         "process_seconds": round(time.perf_counter() - start, 2),
@@ -83,10 +73,10 @@ def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) ->
 def tool(name: str) -> str:
     """Find a console script in this Python's environment or on PATH. Raises BenchError: it is missing."""
     beside = Path(sys.executable).with_name(name)
-    found = str(beside) if beside.is_file() else shutil.which(name)
-    if found is None:
+    path = str(beside) if beside.is_file() else shutil.which(name)
+    if path is None:
         raise BenchError(f"there is no {name}: run this with the Python of an environment that has nerfstudio")
-    return found
+    return path
 
 
 def say(text: str) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.measure.bench.matrix import Chain, Row, Scene, chains
+from tests.bake.conftest import make_surfels
+from tests.bundle.made import make
 
-BUNDLE = Path(__file__).resolve().parents[2] / "e2e/stored/bundle/bundle.json"
 FAKE = """#!{python} -SE
 import json, os, pathlib, sys, time
 
@@ -39,7 +40,8 @@ if name == "ns-train":
 elif name == "ns-export":
     bundle = pathlib.Path(given("--output-dir"))
     bundle.mkdir(parents=True)
-    (bundle / "bundle.json").write_text(pathlib.Path({bundle!r}).read_text())
+    written = pathlib.Path({bundles!r}, given("--format"))
+    (bundle / "bundle.json").write_text((written / "bundle.json").read_text())
     (bundle / "config.yml").write_text("config")
 elif name == "ns-eval":
     assert pathlib.Path(given("--load-config")).is_file()
@@ -54,12 +56,12 @@ elif name == "ns-eval":
 class Fakes:
     """The stubs: calls so far, calls that fail, and calls that block (`slow`) until no longer named."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, bundles: Path) -> None:
         self.folder = folder
         self.log, self.plan, self.slow = files = [folder / name for name in ("log", "fail", "slow")]
         for file in files:
             file.write_text("")
-        paths = {"log": str(self.log), "plan": str(self.plan), "slow": str(self.slow), "bundle": str(BUNDLE)}
+        paths = {"log": str(self.log), "plan": str(self.plan), "slow": str(self.slow), "bundles": str(bundles)}
         for name in ("ns-train", "ns-export", "ns-eval"):
             (folder / name).write_text(FAKE.format(python=sys.executable, **paths))
             (folder / name).chmod(0o755)
@@ -86,12 +88,21 @@ class Fakes:
         return str(link)
 
 
+@pytest.fixture(scope="session")
+def bundles(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of bundles, named by their formats."""
+    folder = tmp_path_factory.mktemp("bundles")
+    for form in ("bc7", "uint8"):
+        make(make_surfels, folder / form, format=form)
+    return folder
+
+
 @pytest.fixture
-def fakes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
+def fakes(bundles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fakes:
     folder = tmp_path / "bin"
     folder.mkdir()
     monkeypatch.setattr("bitymi_ns.measure.bench.engine.tool", lambda name: str(folder / name))
-    return Fakes(folder)
+    return Fakes(folder, bundles)
 
 
 @pytest.fixture
@@ -109,4 +120,4 @@ def capture(tmp_path: Path) -> Callable[[str], Path]:
 def matrix(capture: Callable[[str], Path]) -> list[Chain]:
     """Two captures, two seeds, one format: 16 cells."""
     scenes = [Scene(name, str(capture(name))) for name in ("fox", "lego")]
-    return chains(scenes, {"bitymi": Row(method="bitymi")}, {"bc7": ("--format", "bc7")}, (0, 1), 100)
+    return chains(scenes, {"bitymi": Row("bitymi")}, {"bc7": ("--format", "bc7")}, (0, 1), 100)

@@ -2,11 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 from bitymi_ns import cli
-from bitymi_ns.measure.bench.matrix import local_scenes, read_plan, standard_scenes, suites
+from bitymi_ns.measure.bench.matrix import PlanName, local_scenes, read_plan, standard_scenes, suites
 from bitymi_ns.measure.bench.process import BenchError
 from bitymi_ns.presets import preset_names
 
@@ -61,47 +62,13 @@ def test_local_captures(capture: Callable[[str], Path], tmp_path: Path) -> None:
         local_scenes([])
 
 
-@pytest.mark.parametrize("name", ["ablation", "overdraw", "resolution"])
-def test_plans_name_methods_that_there_are(name: str) -> None:
-    plan = read_plan(name)
-    assert {row.method for row in plan.rows.values()} <= set(preset_names()) and len(plan.rows) > 2
-    assert plan.bundles is not None and len(plan.bundles) == (name == "overdraw")
-    assert len(read_plan("rate").bundles or ()) == 4
-    atlas = read_plan("atlas")
-    assert len(atlas.rows) == 1 and list(atlas.bundles or ())[:2] == ["paper-rule", "local-voxel"]
-    assert all("--format bc7" in " ".join(options) for options in (atlas.bundles or {}).values())
-
-
-def test_a_plan_of_ones_own(tmp_path: Path) -> None:
-    path = tmp_path / "plan.yaml"
-    path.write_text('rows: {a: {method: bitymi, options: [--x, 0.5]}}\nbundles: {small: [--r-max, "16"]}\n')
-    plan = read_plan(str(path))
-    assert plan.rows["a"].options == ["--x", "0.5"] and plan.bundles == {"small": ["--r-max", "16"]}
-    with pytest.raises(BenchError, match="there is no plan x: give ablation"):
-        read_plan("x")
-
-
-@pytest.mark.parametrize(
-    ("text", "reason"),
-    [
-        ("rows: [", "plan.yaml cannot be read: .* line 1, column 8"),
-        ("rows: {}", "rows must have at least 1 item"),
-        ("rows: {a: bitymi}", r"rows.a must be .*a plan has rows, NAME: \{method: NAME"),
-        ("rows: {a: {method: bitymi, option: []}}", "rows.a.option Extra"),
-        ("rows: {a: {method: bitymi, options: --x}}", "rows.a.options must be a valid list"),
-        ("rows: {a: {method: ../x}}", "rows.a.method must match"),
-        ("rows: {a: {method: bitymi}}\nbundle: {}", "bundle Extra"),
-        ("rows: {a: {method: bitymi}}\nbundles: {'../x': []}", "bundles.'../x'"),
-        ("rows: {a: {method: bitymi}}\nbundles: [bc7]", "bundles must be a valid dictionary"),
-        ("3", "plan.yaml: must be a valid dictionary"),
-        ("[" * 5000, "plan.yaml cannot be read: it is nested too deeply"),
-    ],
-)
-def test_a_malformed_plan_says_where(tmp_path: Path, text: str, reason: str) -> None:
-    path = tmp_path / "plan.yaml"
-    path.write_text(text)
-    with pytest.raises(BenchError, match=reason):
-        read_plan(str(path))
+@pytest.mark.parametrize("name", get_args(PlanName))
+def test_plans_name_methods_that_there_are(name: PlanName) -> None:
+    rows, bundles = read_plan(name)
+    counts = {"ablation": (10, 0), "overdraw": (6, 1), "resolution": (4, 0), "atlas": (1, 14), "rate": (1, 4)}
+    assert (len(rows), len(bundles)) == counts[name]
+    assert {row.method for row in rows.values()} <= set(preset_names())
+    assert all(options[0] == "--format" for options in bundles.values())
 
 
 def run(*words: object) -> int:
@@ -111,10 +78,8 @@ def run(*words: object) -> int:
 def test_the_command_prints_the_tables_and_skips_what_is_done(
     fakes, capture: Callable[[str], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plan = "rows: {bitymi: {method: bitymi}}\nbundles: {uint8: [--format, uint8], bc7: [--format, bc7]}"
-    (tmp_path / "p.yaml").write_text(plan)
-    words = ["local", "--data", capture("fox"), "--steps", 10, "--plan", tmp_path / "p.yaml"]
-    words += ["--work", tmp_path / "w", "--output", tmp_path / "table.md", "--extra=--a.b 1"]
+    words = ["local", "--data", capture("fox"), "--steps", 10, "--formats", "uint8", "bc7", "--extra=--a.b 1"]
+    words += ["--work", tmp_path / "w", "--output", tmp_path / "table.md"]
     fakes.fail("--format uint8")
     assert run(*words) == 1
     captured = capsys.readouterr()

@@ -69,7 +69,7 @@ def trained_like(n: int, width: int, height: int, device: torch.device, texture:
     config = SceneConfig(view_color="sv", sv_sites=SITES, texture="hash" if texture else "none", near=0.2)
     field = None
     if texture:
-        field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, 17, g)
+        field = HashField(config, (0.0, 0.0, 5.0), 5.0, True, log2_table_size=17, generator=g)
         with torch.no_grad():
             field.field_w3.copy_(0.1 * normal(*field.field_w3.shape))  # starts at zero
     scene = Scene(config, surfels, field).to(device)

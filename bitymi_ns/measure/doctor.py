@@ -1,4 +1,4 @@
-"""`bitymi doctor`: versions, kernels and devices of this installation, and a training step on each device."""
+"""`bitymi doctor`: versions, kernels and devices, and a training step on each device."""
 
 import importlib
 import importlib.metadata
@@ -29,19 +29,18 @@ CARDS = "index,name,compute_cap,driver_version,memory.total"
 
 
 def examine() -> Iterator[tuple[str, str]]:
-    """Yield a name and a line about each part, the last one for "result", which is empty if `ns-train bitymi` cannot
-    train."""
+    """Yield a name and a line about each part, the last one for "result": empty if `ns-train bitymi` cannot train."""
     yield "system", f"{platform.platform()}, Python {platform.python_version()}"
-    found = {each.metadata["Name"].lower(): each.version for each in importlib.metadata.distributions()}
-    yield "packages", ", ".join(f"{name} {found[name]}" for name in PACKAGES if name in found)
+    installed = {package.metadata["Name"].lower(): package.version for package in importlib.metadata.distributions()}
+    yield "packages", ", ".join(f"{name} {installed[name]}" for name in PACKAGES if name in installed)
     yield "torch", f"CUDA {torch.version.cuda or 'none'}, {torch.get_num_threads()} threads"
     yield "machine", machine()
     cache = user_cache()
     usable = cache is not None and os.access(next(p for p in (cache, *cache.parents) if p.exists()), os.W_OK)
     yield "cache", f"{cache}{'' if usable else ' (cannot be written)'}"
     nvcc = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
-    said = output([nvcc, "--version"]).partition("release ")[2].partition(",")[0] if nvcc else ""
-    yield "nvcc", f"{said or 'does not run'} ({nvcc})" if nvcc else "none"
+    release = output([nvcc, "--version"]).partition("release ")[2].partition(",")[0] if nvcc else ""
+    yield "nvcc", f"{release or 'does not run'} ({nvcc})" if nvcc else "none"
     for card in output(["nvidia-smi", f"--query-gpu={CARDS}", "--format=csv,noheader"]).splitlines() or ["none"]:
         yield "card", card
     try:
@@ -53,7 +52,7 @@ def examine() -> Iterator[tuple[str, str]]:
         yield "kernels", f"CPU: {why(error)}"
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch's, about code of others
+            warnings.simplefilter("ignore")  # about code of others
             from bitymi_ns.plugin.run.config import method_config
             from bitymi_ns.plugin.run.device import built, why_not_cuda
 

@@ -1,4 +1,4 @@
-"""Figures of panels, as PNG: the one style of all plots of this package."""
+"""Figures of panels, as PNG, in one style."""
 
 import io
 import math
@@ -22,21 +22,19 @@ SETTINGS = {
     "ytick.minor.size": 3, "legend.frameon": False, "legend.fontsize": 8, "figure.constrained_layout.use": True,
 }  # fmt: skip
 styled = style.context(("default", SETTINGS))
-"""Decorator of functions that draw. Overrides a matplotlibrc in the current folder, which may enable LaTeX."""
+"""Decorator of functions that draw: overrides a matplotlibrc, which may enable LaTeX."""
 NUMBERS = FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 1000 else f"{value:g}")
 
 
 def panels(titles: Sequence[str], x: str, y: str, most: int = 3) -> tuple[Figure, list[Axes]]:
-    """Create a figure with a panel for each title, which one panel alone does not show, at most `most` per row. `x`,
-    `y`: labels of the axes."""
+    """Create a figure with a panel per title, which a single panel does not show, at most `most` per row. `x`, `y`:
+    labels of the axes."""
     columns = min(most, len(titles))
     rows = math.ceil(len(titles) / columns)
     width, height = (6.4, 3.9) if columns == 1 else (3.5 * columns, 2.9)
     figure = Figure(figsize=(width, rows * height), dpi=160 if columns < 4 else 100)
-    axes = [figure.add_subplot(rows, columns, i + 1, xlabel=x, ylabel=y) for i in range(len(titles))]
-    for panel, title in zip(axes, titles if len(titles) > 1 else [""], strict=True):
-        panel.set_title(title)
-    return figure, axes
+    shown = titles if len(titles) > 1 else [""]
+    return figure, [figure.add_subplot(rows, columns, i, title=t, xlabel=x, ylabel=y) for i, t in enumerate(shown, 1)]
 
 
 def png(figure: Figure, legend: Sequence[Line2D] = ()) -> bytes:

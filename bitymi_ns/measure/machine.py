@@ -1,4 +1,4 @@
-"""Provenance of measured figures: machine, versions, commit."""
+"""Machine, versions and commit of measured figures."""
 
 import functools
 import importlib.metadata
@@ -22,7 +22,7 @@ def output(command: list[str], where: Path | None = None) -> str:
 
 @functools.cache
 def commit() -> str:
-    """Return the checkout's commit, with `+` if the tree is dirty; empty outside a checkout of this project."""
+    """Return the checkout's commit, with `+` if the tree is dirty; empty outside a checkout."""
     where = Path(__file__).resolve().parents[2]
     if not (where / ".git").exists():
         return ""
@@ -31,16 +31,15 @@ def commit() -> str:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that affect results."""
-    found = {"python": platform.python_version()}
+    installed = {"python": platform.python_version()}
     for name in ("bitymi-ns", "torch", "nerfstudio"):
         with suppress(importlib.metadata.PackageNotFoundError):
-            found[name] = importlib.metadata.version(name)
-    return found
+            installed[name] = importlib.metadata.version(name)
+    return installed
 
 
 @functools.cache
 def processor() -> str:
-    """Return the processor's model."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text("utf8").splitlines():
             if line.startswith("model name"):

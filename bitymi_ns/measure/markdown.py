@@ -22,21 +22,20 @@ def escaped(text: str) -> str:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], text_columns: Sequence[int] = (0,)) -> str:
-    """Format a table, without a trailing newline. `rows`: cells, which may contain markup. `text_columns`: indices of
-    left-aligned columns; the others are right-aligned."""
+    """Format a table of cells, which may contain markup. `text_columns`: indices of the left-aligned columns."""
     rule = "".join("---|" if i in text_columns else "---:|" for i in range(len(header)))
     lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
     return "\n".join([lines[0], "|" + rule, *lines[1:]])
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """Format a number with thousands separators; empty for None."""
+    """Format a number; empty for None."""
     return "" if value is None else f"{value:,.{digits}f}"
 
 
 def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str] = ()) -> str:
-    """Format a section: title, command line, machine and commit, body, notes. `commits`: at which the figures were
-    measured; empty: that of this checkout."""
+    """Format a section: title, command line, machine and commit, body, notes. `commits`: those of the figures; empty:
+    this checkout's."""
     measured = sorted(set(commits)) or [commit()]
     script = sys.argv[0].endswith(".py")
     program = ["python", os.path.relpath(sys.argv[0])] if script else [os.path.basename(sys.argv[0])]

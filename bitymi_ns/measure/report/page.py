@@ -1,4 +1,4 @@
-"""Composition of a report as one self-contained HTML page."""
+"""A report as one self-contained HTML page."""
 
 import importlib.metadata
 import os
@@ -20,7 +20,7 @@ GENERATOR = '<meta name="generator" content="bitymi report">'  # marks pages tha
 
 
 def compose(records: Records, title: str) -> dict[str, Any]:
-    """Build the variables of the page's template from records."""
+    """Build the variables of the page's template."""
     notes = list(records.notes)
     scenes = {row.scene for row in records.evaluations}
     counts = {"evaluation": records.evaluations, "training run": records.curves, "scene": scenes}
@@ -37,30 +37,24 @@ def compose(records: Records, title: str) -> dict[str, Any]:
 
 
 def to_page(content: dict[str, Any]) -> str:
-    """Render the report as a self-contained HTML document."""
+    """Render the page."""
     return rendered("report.html.j2", content=content, generator=GENERATOR, columns=NOTES, error_scale=ERROR_SCALE)
 
 
 def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report") -> Path:
-    """Write a report as a self-contained index.html, which replaces an earlier one, and return its path.
+    """Write a report as index.html, which replaces an earlier one, and return its path. Raises ReportError: an input is
+    missing or broken, nothing usable was found, or the report cannot be written.
 
-    Args:
-        inputs: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
-            `fragments`, `psnr`), cells of `bitymi bench`, PNG images of ns-eval, and folders to search for these.
-
-    Raises:
-        ReportError: an input is missing or broken, nothing usable was found, or the report cannot be written.
-    """
+    `inputs`: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
+    `psnr`), cells of `bitymi bench`, PNG images of ns-eval, and folders to search for these."""
     output_dir = Path(os.path.expanduser(output_dir)).absolute()
     page = output_dir / PAGE
     with write_errors_as(output_dir, ReportError):
         check_writable(page)
         if page.exists():
             with open_regular(page) as file:
-                if GENERATOR not in file.read(4096).decode("utf8", "replace"):
-                    raise ReportError(
-                        f"{page} was not made by bitymi report and will not be replaced; give another folder."
-                    )
+                if GENERATOR.encode() not in file.read(4096):
+                    raise ReportError(f"{page} is no report and will not be replaced; give another folder.")
     text = to_page(compose(collect(list(inputs), output_dir), title))
     with write_errors_as(output_dir, ReportError):
         write_file(page, text.encode("utf8"))

@@ -1,9 +1,7 @@
-"""Images embedded in a report: the best, median and worst held-out views that `ns-eval --render-output-path` wrote
-(photograph, render, error; side by side if folders show the same photographs)."""
+"""Images in a report: the worst, median and best held-out views that `ns-eval --render-output-path` wrote."""
 
 import hashlib
 import io
-import math
 import os
 import re
 from collections.abc import Sequence
@@ -19,7 +17,7 @@ from bitymi_ns.safe_reading import open_regular
 from .records import grouped
 
 SIDE_BY_SIDE = re.compile(r"eval_img_(\d{4,})\.png$", re.IGNORECASE)
-"""File name of a photograph beside its render, as `ns-eval --render-output-path` writes it."""
+"""File name of a photograph beside its render, as ns-eval writes it."""
 ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
 MAX_SETS = 4  # sets of photographs per page
 MAX_WIDTH = 1200  # of embedded images, pixels
@@ -65,7 +63,7 @@ def open_image(path: Path) -> Image.Image:
 
 
 def _encode(pixels: Pixels, caption: str) -> Picture:
-    """Scale an image [H, W, 3] in [0, 1] down if it is wide, and encode it."""
+    """Encode an image [H, W, 3] in [0, 1], scaled down if it is wide."""
     image = Image.fromarray((pixels * 255.0).round().astype(np.uint8))
     image.thumbnail((MAX_WIDTH, image.height), Image.Resampling.LANCZOS)
     buffer = io.BytesIO()
@@ -76,18 +74,28 @@ def _encode(pixels: Pixels, caption: str) -> Picture:
 def _halves(path: Path) -> tuple[Pixels, Pixels]:
     """Read photograph and render, [H, W, 3] in [0, 1], from an image of both."""
     pixels = np.asarray(open_image(path), np.float32) / 255.0
-    width = pixels.shape[1] // 2
-    if pixels.shape[1] != 2 * width or width == 0:
-        raise OSError(f"its width of {pixels.shape[1]} pixels is not that of two equal pictures")
-    return pixels[:, :width], pixels[:, width:]
+    width = pixels.shape[1]
+    if width % 2:
+        raise OSError(f"its width of {width} pixels is not that of two equal pictures")
+    return pixels[:, : width // 2], pixels[:, width // 2 :]
+
+
+def _columns(views: dict[str, View]) -> list[list[Picture]]:
+    """Draw a photograph, and each folder's render above its error map; with one folder beside it."""
+    columns = []
+    for name, view in views.items():
+        photograph, render = _halves(view.path)
+        error = np.clip(np.abs(photograph - render).mean(-1) / ERROR_SCALE, 0.0, 1.0)
+        heat = matplotlib.colormaps["inferno"](error)[..., :3].astype(np.float32)
+        drawn = [_encode(render, f"{name}: {view.psnr:.2f} dB"), _encode(heat, f"error of {name}")]
+        columns = columns or [[_encode(photograph, "photograph")]]
+        columns += [drawn] if len(views) > 1 else [[picture] for picture in drawn]
+    return columns
 
 
 def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
-    """Choose and encode views among images of photographs beside renders; appends a note for unreadable images.
-
-    The columns of a view are the photograph and, for each folder, the render above its error map; with one folder the
-    error map is beside the render. Views are ranked by PSNR without masks, averaged over the folders.
-    """
+    """Choose and draw views among images of photographs beside renders, in groups of folders that show the same
+    photographs; appends a note for unreadable images. Views are ranked by PSNR, averaged over the folders."""
     folders: dict[Path, dict[int, View]] = {}
     for path in sorted(p.resolve() for p in images):
         match = SIDE_BY_SIDE.match(path.name)
@@ -98,10 +106,9 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
         except OSError as error:
             notes.append(f"{path} is not an image that can be shown: {error}.")
             continue
-        squared = float(np.mean((photograph - render) ** 2, dtype=np.float64))
+        psnr = -10.0 * np.log10(max(1e-10, np.mean((photograph - render) ** 2, dtype=np.float64)))
         digest = hashlib.sha256(photograph.tobytes()).digest()
-        view = View(path, -10.0 * math.log10(max(1e-10, squared)), digest)
-        folders.setdefault(path.parent, {})[int(match[1])] = view
+        folders.setdefault(path.parent, {})[int(match[1])] = View(path, float(psnr), digest)
     sets = list(grouped(folders, lambda f: tuple((i, view.digest) for i, view in folders[f].items())).values())
     if len(sets) > MAX_SETS:
         notes.append(f"Views of {len(sets) - MAX_SETS} more sets are not shown; the page holds those of {MAX_SETS}.")
@@ -109,19 +116,13 @@ def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
     groups = []
     for members in sets[:MAX_SETS]:
         views = {os.path.relpath(folder, shared): folders[folder] for folder in sorted(members)}
-        first = folders[members[0]]
-        ranked = sorted(first, key=lambda index, views=views: sum(of[index].psnr for of in views.values()))
         title = f"{', '.join(views)}: " if len(sets) > 1 else ""
+        numbers = list(folders[members[0]])
+        ranked = sorted(numbers, key=lambda i, views=views: sum(folder[i].psnr for folder in views.values()))
         chosen: dict[int, str] = {}
         for rank, quantile in RANKS.items():
             chosen.setdefault(ranked[round(quantile * (len(ranked) - 1))], rank)
-        for index, rank in chosen.items():
-            columns = [[_encode(_halves(first[index].path)[0], "photograph")]]
-            for name, of in views.items():
-                photograph, render = _halves(of[index].path)
-                error = np.clip(np.abs(photograph - render).mean(-1) / ERROR_SCALE, 0.0, 1.0)
-                heat = matplotlib.colormaps["inferno"](error)[..., :3].astype(np.float32)
-                drawn = [_encode(render, f"{name}: {of[index].psnr:.2f} dB"), _encode(heat, f"error of {name}")]
-                columns += [drawn] if len(views) > 1 else [[picture] for picture in drawn]
-            groups.append(Group(f"{title}{rank} of {len(ranked)}: number {index}", columns))
+        for i, rank in chosen.items():
+            columns = _columns({name: folder[i] for name, folder in views.items()})
+            groups.append(Group(f"{title}{rank} of {len(ranked)}: number {i}", columns))
     return groups

@@ -1,7 +1,8 @@
-"""Plots of a report: training curves, and quality against cost with Pareto fronts; one panel per scene."""
+"""Plots of a report: training curves, and quality against cost with Pareto fronts."""
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import cycle
 from typing import Any, NamedTuple
 
 from matplotlib.axes import Axes
@@ -10,8 +11,7 @@ from matplotlib.lines import Line2D
 from bitymi_ns.measure.figure import COLORS, INK, log_when_wide, panels, png, styled
 from .records import Curve, Evaluation
 
-MARKERS = ("s", "^", "D", "v", "P", "X", "*", "p", "<", ">", "h", "d", "8", "H")
-"""Markers of bundles, one per format."""
+MARKERS = "s^DvPX*p<>hd8H"  # of bundles, one per format
 HOLLOW: dict[str, Any] = {"marker": "o", "ms": 7, "markerfacecolor": "white", "markeredgewidth": 1.8}
 """Marker of trained scenes."""
 DASHES: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 3))}  # of Pareto fronts
@@ -30,25 +30,23 @@ METRICS = {
     "lpips_vgg": ("LPIPS (VGG)", False, 0.01),
 }
 """Metric -> title, True if higher is better, minimum span of its axis."""
-MIN_POINTS = 3  # minimum number of points of a plot; for fewer the tables suffice
+MIN_POINTS = 3  # of a plot; for fewer the tables suffice
 
 
 class Plot(NamedTuple):
-    """A plot: title, section of the page, number of panels, PNG bytes."""
-
     title: str
-    section: str
+    section: str  # of the page
     panels: int
     png: bytes
 
 
 class Cost(NamedTuple):
-    """A cost axis: label, section of the page, key of the results and factor to the axis's unit."""
+    """A cost axis."""
 
     label: str
-    section: str
-    key: str
-    factor: float = 1.0
+    section: str  # of the page
+    key: str  # of the results
+    factor: float = 1.0  # to the axis's unit
 
     def value(self, row: Evaluation) -> float | None:
         """Return the cost of an evaluation; None if it is unknown or 0."""
@@ -63,8 +61,8 @@ COSTS = (
 
 
 def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, float]]:
-    """Compute the Pareto front of (cost, quality) points, cheapest first, without duplicates. `points`: costs (lower is
-    better) and qualities. `up`: higher quality is better (PSNR), else lower (FLIP)."""
+    """Compute the Pareto front of (cost, quality) points, cheapest first. `up`: higher quality is better, else
+    lower."""
     best: list[tuple[float, float]] = []
     for cost, quality in sorted(set(points), key=lambda p: (p[0], -p[1] if up else p[1])):
         if not best or (quality > best[-1][1] if up else quality < best[-1][1]):
@@ -76,7 +74,7 @@ def front(points: Sequence[tuple[float, float]], up: bool) -> list[tuple[float, 
 def draw_plots(evaluations: list[Evaluation], curves: list[Curve]) -> list[Plot]:
     """Draw all plots that have a panel with at least MIN_POINTS points."""
     names = dict.fromkeys([*sorted({e.method for e in evaluations}), *sorted({c.label for c in curves})])
-    colors = {name: COLORS[i % len(COLORS)] for i, name in enumerate(names)}
+    colors = dict(zip(names, cycle(COLORS), strict=False))
     plots = [curve_plot(*axes, curves, colors) for axes in CURVES]
     plots += [pareto_plot(key, cost, evaluations, colors) for cost in COSTS for key in METRICS]
     return [plot for plot in plots if plot is not None]
@@ -105,8 +103,7 @@ def curve_plot(
 def pareto_panel(
     axes: Axes, rows: list[Evaluation], key: str, cost: Cost, colors: dict[str, str], markers: dict[str, str]
 ) -> None:
-    """Draw quality against cost of one scene: hollow circles for trained scenes, filled markers for bundles, a line per
-    method, and the Pareto front of all points."""
+    """Draw quality against cost of one scene: trained scenes, bundles, a line per method, and the Pareto front."""
     _, up, span = METRICS[key]
     points = [(x, e.results[key]) for e in rows if (x := cost.value(e)) is not None]
     best = front(points, up)
@@ -130,14 +127,14 @@ def pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: dic
     drawn = [e for e in evaluations if cost.value(e) is not None and key in e.results]
     if max(Counter(e.scene for e in drawn).values(), default=0) < MIN_POINTS:
         return None
-    variants = sorted({_variant(e) for e in drawn if e.baked})
-    markers = {variant: MARKERS[i % len(MARKERS)] for i, variant in enumerate(variants)}
+    markers = dict(zip(sorted({_variant(e) for e in drawn if e.baked}), cycle(MARKERS), strict=False))
     legend = [Line2D([], [], color=colors[m], label=m, linewidth=4) for m in sorted({e.method for e in drawn})]
     mark: dict[str, Any] = {"color": INK, "linestyle": ""}
     if any(not e.baked for e in drawn):
         legend.append(Line2D([], [], label="trained", **HOLLOW, **mark))
-    names = {variant: f"baked, {variant}" if variant else "baked" for variant in variants}
-    legend += [Line2D([], [], marker=markers[v], ms=6, label=name, **mark) for v, name in names.items()]
+    for variant, marker in markers.items():
+        label = f"baked, {variant}" if variant else "baked"
+        legend.append(Line2D([], [], marker=marker, ms=6, label=label, **mark))
     legend.append(Line2D([], [], color=INK, label="Pareto front: no point is better in both", **DASHES))
     scenes, quality = sorted({e.scene for e in drawn}), METRICS[key][0]
     figure, axes = panels(scenes, cost.label, quality)
@@ -148,5 +145,5 @@ def pareto_plot(key: str, cost: Cost, evaluations: list[Evaluation], colors: dic
 
 
 def _variant(row: Evaluation) -> str:
-    """Strip the method from a label, which leaves the bundle's name or another distinguishing suffix."""
+    """Strip the method from a label, which leaves the bundle's name."""
     return (row.group or row.label).removeprefix(row.method).strip(", ()")

@@ -1,4 +1,4 @@
-"""Readers of a report's inputs: ns-eval files, training curves, benchmark cells, images, and folders of these."""
+"""Readers of a report's inputs."""
 
 import os
 from collections import Counter
@@ -12,15 +12,7 @@ from bitymi_ns.measure.bench.cells import NOT_OF_A_RUN, Cells, identity
 from bitymi_ns.safe_reading import read_json, read_text, reading
 from bitymi_ns.trust import finite_numbers, json_of
 from .pictures import SIDE_BY_SIDE
-from .records import (
-    Evaluation,
-    Records,
-    ReportError,
-    curve_from,
-    evaluation_from,
-    grouped,
-    link,
-)
+from .records import Evaluation, Records, ReportError, curve_from, evaluation_from, grouped, link
 
 MAX_BYTES = 64 << 20  # larger files are not evaluations
 ADVICE = "Write it again, or leave it out."
@@ -31,14 +23,12 @@ def _refuse(message: str, cause: BaseException) -> NoReturn:
 
 
 def is_evaluation(data: Any) -> bool:
-    """Return True for ns-eval's JSON."""
     return isinstance(data, dict) and isinstance(data.get("results"), dict)
 
 
 def read_jsonl(path: Path) -> Records:
-    """Read evaluations and the curve of a JSONL file; empty if it holds something else.
-
-    A truncated last line (of a killed run) is skipped with a note. Raises ReportError: another line is broken."""
+    """Read evaluations and the curve of a JSONL file; empty if it holds something else. A truncated last line (of a
+    killed run) is skipped with a note. Raises ReportError: another line is broken."""
     with reading(path, _refuse, ADVICE):
         lines = [(i, s) for i, s in enumerate(read_text(path, MAX_BYTES).splitlines(), 1) if s.strip()]
     values, notes = [], []
@@ -55,8 +45,8 @@ def read_jsonl(path: Path) -> Records:
 
 
 def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
-    """Add the cells of a benchmark, and the curves and images that they name, if these exist. `cells`: of the file
-    `path`. Raises ReportError: a cell lacks an entry that its kind requires."""
+    """Add cells of the file `path`, and the curves and images that they name, if these exist. Raises ReportError: a
+    cell lacks an entry."""
     with reading(f"{path}: a cell", _refuse, passing=(ReportError,)):
         runs = grouped(cells, lambda cell: identity(cell["key"], *NOT_OF_A_RUN))
         keys = [of_run[0]["key"] for of_run in runs.values()]
@@ -72,7 +62,7 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
 
 
 def _add_run(trained: Evaluation, suffix: str, of_run: list[dict[str, Any]], records: Records) -> None:
-    """Add the cells of a run; `trained` is the evaluation of its trained scene without results."""
+    """Add the cells of a run. `trained`: the evaluation of its trained scene, without results."""
     values: dict[tuple[str, str], dict[str, Any]] = {}  # by kind and bundle
     for cell in of_run:
         values[cell["key"].get("cell"), cell["key"].get("bundle", "")] = cell["value"]
@@ -107,8 +97,8 @@ def _add_run(trained: Evaluation, suffix: str, of_run: list[dict[str, Any]], rec
 
 
 def _walk(folder: Path, skip: Path) -> Iterator[Path]:
-    """List the files below a folder that may be inputs, without hidden folders and `skip`; of a benchmark's work folder
-    only its cells, which name all other files."""
+    """List the files below a folder that may be inputs, except in hidden folders and `skip`; of a benchmark's work
+    folder only its cells, which name all other files."""
     for root, folders, files in os.walk(folder):
         here = Path(root)
         if CELLS in files:
@@ -127,22 +117,22 @@ def _read(path: Path) -> Records:
         return Records(images=[path])
     if path.suffix.lower() == ".jsonl" and path.name != CELLS:
         return read_jsonl(path)
-    found = Records()
+    records = Records()
     with reading(path, _refuse, ADVICE, passing=(ReportError,)):
         if path.name == CELLS:
-            add_cells(Cells(path).known.values(), path, found)
+            add_cells(Cells(path).known.values(), path, records)
         elif is_evaluation(data := read_json(path, MAX_BYTES)):
-            found.evaluations.append(evaluation_from(data, path))
-    return found
+            records.evaluations.append(evaluation_from(data, path))
+    return records
 
 
 def collect(inputs: list[Path], output_dir: Path) -> Records:
-    """Read all inputs: files, and folders to search for files, except that of the report. Raises ReportError: a named
-    file is missing, broken, or of an unknown kind; or nothing usable was found."""
+    """Read files, and folders, in which the report's is not searched. Raises ReportError: a named file is missing,
+    broken, or of an unknown kind; or nothing usable was found."""
     records, seen = Records(), set()
-    # named files first: their errors are fatal, also if a folder contains the same file
     paths = [Path(os.path.expanduser(p)) for p in inputs]
-    for path in sorted(paths, key=lambda p: p.is_dir()):
+    # named files first: their errors are fatal, also if a folder contains the same file
+    for path in sorted(paths, key=Path.is_dir):
         if not path.exists():
             raise ReportError(f"{path} does not exist. Give ns-eval JSON files, training curves (.jsonl) or folders.")
         for file in _walk(path.resolve(), output_dir.resolve()) if path.is_dir() else [path]:
@@ -150,25 +140,25 @@ def collect(inputs: list[Path], output_dir: Path) -> Records:
                 continue
             seen.add(file.resolve())
             try:
-                found = _read(file)
+                more = _read(file)
             except ReportError as error:
                 if file is path:
                     raise
                 records.notes.append(str(error))
                 continue
-            for name, values in vars(found).items():
+            for name, values in vars(more).items():
                 vars(records)[name] += values
-            if file is path and not (found.images or found.evaluations or found.curves):
+            if file is path and not (more.images or more.evaluations or more.curves):
                 raise ReportError(
-                    f"{path} holds neither an evaluation (a JSON object with 'results', as ns-eval writes it) "
-                    "nor a training curve (JSON lines with 'step') nor lines of bitymi bench."
+                    f"{path} holds neither an evaluation (JSON of ns-eval with 'results') nor a training curve (JSON "
+                    "lines with 'step') nor lines of bitymi bench."
                 )
     if not (records.evaluations or records.curves):
         where = ", ".join(map(str, paths)) or "no inputs"
-        more = "".join(f"\n  {note}" for note in records.notes)
+        notes = "".join(f"\n  {note}" for note in records.notes)
         raise ReportError(
-            f"nothing to report in {where}: no ns-eval JSON and no training curve. Run "
-            f"`ns-eval --load-config <config.yml> --output-path eval.json` and name that file or its folder.{more}"
+            f"nothing to report in {where}: name the file or folder of a training curve, or of "
+            f"`ns-eval --load-config <config.yml> --output-path eval.json`.{notes}"
         )
     link(records)
     return records

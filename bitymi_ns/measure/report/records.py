@@ -1,4 +1,4 @@
-"""Records of a report and the links between them: evaluations, training curves."""
+"""Records of a report and the links between them."""
 
 import os
 import statistics
@@ -14,45 +14,44 @@ K = TypeVar("K", bound=Hashable)
 
 
 class ReportError(ValueError):
-    """The report cannot be made; the message names the input at fault and what to do."""
+    """The report cannot be made; the message names the input and what to do."""
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Evaluation of a model on the held-out views."""
+    """Evaluation of a trained scene or a bundle on the held-out views."""
 
-    scene: str  # experiment name; evaluations are compared within one scene
-    method: str  # method name, which a bundle shares with its trained scene
+    scene: str  # experiment name
+    method: str  # which a bundle shares with its trained scene
     baked: bool  # True for a bundle
     label: str  # for tables, unique within its scene and stage after `disambiguate`
     results: dict[str, float]  # finite numbers by name (psnr, ssim, render_ms, bundle_bytes, ...)
-    source: Path  # file it was read from
+    source: Path
     group: str = ""  # label without the seed; empty: not grouped over seeds
     series: str = ""  # identity of the training run without its seed
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Training curve: points by step, each a dict of finite numbers with at least `step`."""
+    """Training curve."""
 
     scene: str
     label: str
-    points: list[dict[str, float]]
+    points: list[dict[str, float]]  # in the order of their `step`; finite numbers
     source: Path
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
         """Return the columns x and y of the points that have both."""
-        pairs = [(p[x], p[y]) for p in self.points if x in p and y in p]
-        return [a for a, _ in pairs], [b for _, b in pairs]
+        points = [p for p in self.points if x in p and y in p]
+        return [p[x] for p in points], [p[y] for p in points]
 
     def last(self, key: str) -> float | None:
-        """Return the last recorded value of `key`, or None."""
         return next((p[key] for p in reversed(self.points) if key in p), None)
 
 
 @dataclass
 class Records:
-    """All records read, with notes on skipped inputs."""
+    """Everything read, with notes on skipped inputs."""
 
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
@@ -62,7 +61,7 @@ class Records:
 
 
 def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
-    """Build an evaluation from ns-eval's JSON object."""
+    """Build an evaluation from ns-eval's JSON."""
     results = finite_numbers(data["results"])
     method = str(data.get("method_name") or "unnamed method")
     scene = str(data.get("experiment_name") or source.parent.name or "unnamed scene")
@@ -70,8 +69,7 @@ def evaluation_from(data: dict[str, Any], source: Path) -> Evaluation:
 
 
 def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
-    """Build a curve from the objects of a JSONL file, whose `experiment_name` and `method_name` name it, else its file.
-    If a step occurs twice (a resumed run), its last line is used."""
+    """Build a curve from the objects of a JSONL file. If a step occurs twice (a resumed run), its last line is used."""
     points = {numbers["step"]: numbers for numbers in map(finite_numbers, lines)}
     named = {key: value for line in lines for key, value in line.items() if isinstance(value, str) and value}
     scene, label = named.get("experiment_name", ""), named.get("method_name", source.stem)
@@ -79,9 +77,9 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
 
 
 def link(records: Records) -> None:
-    """Link records: make labels unique, and add to evaluations of files the training times of the only curve of their
-    scene and method, and to bundles the difference from their trained scene (`psnr_delta`): the only one of the same
-    scene and method, or of these the only one in the same folder."""
+    """Make labels unique; add to evaluations of files the training times of the only curve of their scene and method,
+    and to bundles the difference from their trained scene (`psnr_delta`): the only one of the same scene and method, or
+    of these the only one in the same folder."""
     disambiguate(records.evaluations)
     disambiguate(records.curves)
     of_files = [row for row in records.evaluations if not row.series]  # those of a benchmark state both
@@ -109,13 +107,13 @@ def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
 
 
 def means(rows: Sequence[Mapping[str, float]]) -> dict[str, float]:
-    """Average the figures that all rows have, by name."""
+    """Average the figures that all rows have."""
     names = sorted(set.intersection(*map(set, rows)))
     return {name: statistics.fmean(row[name] for row in rows) for name in names}
 
 
 def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
-    """Average runs that differ only in their seed; `psnr_seeds` is the standard deviation of their PSNR."""
+    """Average runs that differ only in their seed. `psnr_seeds`: standard deviation of their PSNR."""
     merged = []
     for rows in grouped(evaluations, lambda row: (row.scene, row.baked, row.group, row.series)).values():
         if len(rows) == 1 or not rows[0].group:
@@ -128,7 +126,7 @@ def over_seeds(evaluations: list[Evaluation]) -> list[Evaluation]:
 
 
 def disambiguate(items: list) -> None:
-    """Add their files to equal labels of evaluations (of a scene and stage) or curves (of a scene), in place."""
+    """Add their files, in place, to equal labels of evaluations (of a scene and stage) or curves (of a scene)."""
     same = grouped(range(len(items)), lambda i: (items[i].scene, getattr(items[i], "baked", None), items[i].label))
     for indices in same.values():
         shared = os.path.commonpath([items[i].source.resolve().parent for i in indices])

@@ -13,15 +13,11 @@ ARROWS = {"up": " ↑", "down": " ↓", None: ""}  # to the better direction, as
 
 
 class Row(NamedTuple):
-    """A row of strings; `best` are the columns in which it has the table's best value. A section row has one cell."""
-
-    cells: list[str]
-    best: set[int]
+    cells: list[str]  # a section has one
+    best: set[int]  # columns in which it has the table's best value
 
 
 class Table(NamedTuple):
-    """A titled table of names (first column) and numbers."""
-
     title: str
     header: Sequence[str]
     rows: Sequence[Row]
@@ -29,21 +25,21 @@ class Table(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column of numbers: title, key of the results, format, and which direction is better."""
+    """A column of numbers."""
 
     title: str
-    key: str
+    key: str  # of the results
     text: Callable[[float], str]
     better: Literal["up", "down"] | None = None
 
     def value(self, row: Evaluation) -> float | None:
-        """Return the figure of an evaluation if it has one that applies: of the training for trained scenes, of an
-        atlas for bundles."""
+        """Return the figure of an evaluation if it applies: of the training to trained scenes, of an atlas to
+        bundles."""
         return None if self.key.startswith("train_" if row.baked else "atlas_") else row.results.get(self.key)
 
 
 def significant(value: float) -> str:
-    """Format about three significant digits, without an exponent for usual sizes."""
+    """Format about three significant digits."""
     magnitude = abs(value)
     if magnitude < 0.01:
         return f"{value:.2g}"
@@ -52,7 +48,6 @@ def significant(value: float) -> str:
 
 
 def megabytes(value: float) -> str:
-    """Format bytes as MB of 10^6."""
     return significant(value / 1e6)
 
 
@@ -84,23 +79,22 @@ TRAINING = (
     Column("Peak MB", "train_peak_bytes", lambda value: f"{value / 1e6:,.0f}", "down"),
 )
 KINDS = {"": COLUMNS, ", exposure aside": FITTED, ", training": TRAINING}
-"""Columns of each kind of table by the end of its title; several kinds, so that a table fits a window."""
+"""Columns of each kind of table by the end of its title; a table fits a window."""
 STAGES = {False: "Trained scene", True: "Baked bundle"}
 
 NOTES = (
-    "ms: rendering alone, warmed up (the fps of ns-eval also times metrics and files, so it is not shown). 1 MB = 10⁶ "
-    "bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation of the PSNR over seeds. "
-    "Fitted: each half of a view after the affine map of its colours that fits the other half to the photograph, so "
-    "that exposure and white balance do not count. Carried, refined: held-out poses moved as the nearest photographs' "
-    "were, or aligned to the scene. Mean exposure: drawn with the mean of the photographs' exposures, the others with "
-    "the exposure interpolated from the neighbouring photographs. Training: seconds of the steps alone, peak memory of "
-    "ns-train as a whole. Bold: best of a table."
+    "ms: rendering alone, warmed up. 1 MB = 10⁶ bytes. ΔPSNR: baked minus trained, in dB. ± seeds: standard deviation "
+    "of the PSNR over seeds. Fitted: each half of a view after the affine map of its colours that fits the other half "
+    "to the photograph, so that exposure and white balance do not count. Carried, refined: held-out poses moved as the "
+    "nearest photographs' were, or aligned to the scene. Mean exposure: drawn with the mean of the photographs' "
+    "exposures, the others with that interpolated from the neighbouring photographs. Training: seconds of the steps "
+    "alone, peak memory of ns-train as a whole. Bold: best of a table."
 )
 
 
 def scene_table(title: str, evaluations: list[Evaluation], columns: Sequence[Column], note: str = "") -> Table:
-    """Build the table of one scene: a section of trained scenes, then one of bundles, with the best values of each
-    column marked unless all are equal."""
+    """Build the table of one scene: sections of trained scenes and of bundles, with the best values of each column
+    marked unless all are equal."""
     ordered = sorted(evaluations, key=lambda row: (row.baked, row.label))
     figures = {column: [column.value(row) for row in ordered] for column in columns}
     figures = {column: values for column, values in figures.items() if any(value is not None for value in values)}
@@ -122,8 +116,8 @@ def scene_table(title: str, evaluations: list[Evaluation], columns: Sequence[Col
 
 
 def quality_tables(evaluations: list[Evaluation]) -> list[Table]:
-    """Build one table per scene and one of means over scenes, of each of the KINDS. The means are those of the labels
-    evaluated on the largest set of scenes: means over different scenes are not comparable."""
+    """Build tables of each of the KINDS: one per scene, and one of the means of the labels evaluated on the largest set
+    of scenes, as means over different scenes are not comparable."""
     tables = []
     for kind, columns in KINDS.items():
         rows = [row for row in evaluations if any(column.value(row) is not None for column in columns)]
@@ -143,16 +137,16 @@ def to_markdown(table: Table) -> str:
     """Format a table as Markdown, without its title."""
     rows = []
     for row in table.rows:
-        if len(row.cells) == 1:
-            rows.append([f"*{row.cells[0]}*", *[""] * (len(table.header) - 1)])
+        cells = [escaped(text) for text in row.cells]
+        if len(cells) == 1:
+            rows.append([f"*{cells[0]}*", *[""] * (len(table.header) - 1)])
         else:
-            cells = [escaped(text) for text in row.cells]
             rows.append([f"**{cell}**" if i in row.best else cell for i, cell in enumerate(cells)])
     return markdown.table([escaped(text) for text in table.header], rows)
 
 
 def quality_markdown(evaluations: list[Evaluation]) -> str:
-    """Format the tables of evaluations as Markdown, each with its title and note."""
+    """Format the tables of evaluations as Markdown, with titles and notes."""
     parts = []
     for table in quality_tables(evaluations):
         parts += [f"### {table.title}", to_markdown(table), *filter(None, [table.note])]

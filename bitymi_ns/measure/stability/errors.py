@@ -16,18 +16,7 @@ from bitymi_ns.ops.reference import render as reference_render
 from bitymi_ns.ops.reference import view_color as reference_view_color
 from bitymi_ns.ops.reference.view_color import view_directions
 from bitymi_ns.scene.camera import Camera
-from .scenes import (
-    ALPHAS,
-    PLAIN,
-    RIM,
-    SV_KEYS,
-    TEXELS,
-    SceneCase,
-    Way,
-    cells,
-    tile_images,
-    tiles_of,
-)
+from .scenes import ALPHAS, PLAIN, RIM, SV_KEYS, TEXELS, SceneCase, Way, cells, tile_images, tiles_of
 
 
 @dataclass(frozen=True)
@@ -36,19 +25,16 @@ class Backend:
 
     name: str  # for tables and tests
     device: str  # of its tensors
-    use: Callable[[], AbstractContextManager[object]] = nullcontext  # context that selects it in `bitymi_ns.ops`
+    use: Callable[[], AbstractContextManager[object]] = nullcontext  # selects it in `bitymi_ns.ops`
 
 
-BACKENDS = {
-    "cpu": Backend("cpu", "cpu"),
-    "cuda": Backend("cuda", "cuda"),
-    "emulated": Backend("emulated", "cpu", emulated_cuda),
-}
-"""Backends by name; tests/stress runs every case on the available ones. `emulated`: CUDA kernels run on the host."""
+_ALL = Backend("cpu", "cpu"), Backend("cuda", "cuda"), Backend("emulated", "cpu", emulated_cuda)
+BACKENDS = {backend.name: backend for backend in _ALL}
+"""By name; tests/stress runs every case on the available ones. `emulated`: CUDA kernels run on the host."""
 
 
 def missing(backend: Backend) -> str:
-    """Return the reason why a backend cannot be used here; empty if it can."""
+    """Say why a backend cannot be used here; empty if it can."""
     device = torch.device(backend.device)
     if device.type == "cuda" and not torch.cuda.is_available():
         return "no CUDA device (or torch without CUDA)"
@@ -65,17 +51,16 @@ SIZES = {"rgb": 3, "alpha": 1, "beta_map": 1, "depth": 1, "normal": 3}
 """Channels of the image of `ops.blended_image`."""
 ROUNDING = {torch.float32: 2.0**-24, torch.float64: 2.0**-53}
 NOTHING = 1e-15
-"""Images and gradients below this everywhere are compared absolutely: they are rounding errors of both sides."""
+"""Images and gradients below this everywhere are rounding errors and compared absolutely."""
 PROBES = 3  # random perturbations of the inputs for `Errors.input_*`
 
 
 class Errors(NamedTuple):
     """Errors of one case, each the maximum over all elements, relative to the largest value of the image or gradient.
 
-    A pixel is compared only if both renderers blend the same surfels there, in the same branch of the kernel, and fetch
-    between the same texels. The gradients are those of a loss over these pixels. In the other, flipped pixels rounding
-    moved a value across a threshold (1/255, the transmittance, the larger branch, a texel's centre), so that the
-    renderers sum different terms.
+    A pixel is compared, and counts for the loss, only if both renderers blend the same surfels there, in the same
+    branch of the kernel, and fetch between the same texels. In the other, flipped pixels rounding moved a value across
+    a threshold.
     """
 
     forward: float  # largest error of rgb, alpha, depth, normal and Beta map
@@ -96,7 +81,7 @@ class Errors(NamedTuple):
 
 class _Result(NamedTuple):
     images: dict[str, Tensor]  # [P, C] each, with autograd graph
-    terms: Tensor  # [P, N] int64, see `_terms`; 0: the surfel is not blended
+    terms: Tensor  # [P, N], see `_terms`; 0: the surfel is not blended
     leaves: dict[str, Tensor]
 
 
@@ -107,15 +92,15 @@ def _terms(uv: Tensor, low_pass: Tensor, textured: bool) -> Tensor:
 
 
 def _same(got: _Result, want: _Result) -> Tensor:
-    """Find the pixels, [P] bool, in which both sum the same terms."""
+    """Find the pixels [P] in which both sum the same terms."""
     return ((got.terms == want.terms) & (got.terms >= 0)).all(1)
 
 
 def measure(
     case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float32, near: float = 0.2, way: Way = PLAIN
 ) -> Errors:
-    """Render and differentiate a case with a backend and with the reference, from inputs rounded to `dtype`. `near`:
-    near plane, camera z."""
+    """Compare renders and gradients of a backend with the reference's, from inputs rounded to `dtype`. `near`: near
+    plane, camera z."""
     rounded = _map(way.of(case), lambda t: t.to(dtype).double())
     with backend.use():
         got = _by_kernels(rounded, backend.device, dtype, near)
@@ -135,11 +120,10 @@ def measure(
         return values * (1 + ROUNDING[dtype] * signs)
 
     for _ in range(PROBES):
-        moved = _map(rounded, probe)
-        other = _by_reference(moved, near)
-        agree = _same(other, want)
-        input_forward = max(input_forward, _image_error(other.images, want.images, agree))
-        here, there = (_gradients(result, weights, agree & same) for result in (want, other))
+        moved = _by_reference(_map(rounded, probe), near)
+        agree = _same(moved, want)
+        input_forward = max(input_forward, _image_error(moved.images, want.images, agree))
+        here, there = (_gradients(result, weights, agree & same) for result in (want, moved))
         input_gradient = max(input_gradient, *(_relative(there[key], here[key]) for key in here))
     return Errors(
         forward=_image_error(got.images, want.images, same),
@@ -188,7 +172,7 @@ def _by_reference(case: SceneCase, near: float) -> _Result:
 
 
 def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Draw random loss weights per pixel and channel, normalised by each image's largest value."""
+    """Draw random loss weights per pixel and channel, relative to each image's largest value."""
     generator = torch.Generator().manual_seed(1)
     weights = {}
     for key, image in images.items():
@@ -200,15 +184,13 @@ def _loss_weights(images: dict[str, Tensor]) -> dict[str, Tensor]:
 
 def _gradients(result: _Result, weights: dict[str, Tensor], pixels: Tensor) -> dict[str, Tensor]:
     """Compute d sum(weights * images over `pixels`) / d leaves, float64 on the CPU."""
-    leaves = result.leaves
     loss = torch.zeros(())
     for key, image in result.images.items():
         loss = loss + (image * torch.where(pixels[:, None], weights[key], 0.0).to(image)).sum()
-    grads = torch.autograd.grad(loss, list(leaves.values()), retain_graph=True, allow_unused=True)
-    return {
-        key: torch.zeros_like(leaf, dtype=torch.float64, device="cpu") if grad is None else grad.detach().double().cpu()
-        for (key, leaf), grad in zip(leaves.items(), grads, strict=True)
-    }
+    grads = torch.autograd.grad(
+        loss, list(result.leaves.values()), retain_graph=True, allow_unused=True, materialize_grads=True
+    )
+    return {key: grad.double().cpu() for key, grad in zip(result.leaves, grads, strict=True)}
 
 
 def _image_error(got: dict[str, Tensor], want: dict[str, Tensor], pixels: Tensor) -> float:
@@ -216,7 +198,7 @@ def _image_error(got: dict[str, Tensor], want: dict[str, Tensor], pixels: Tensor
 
 
 def _relative(got: Tensor, want: Tensor, rows: Tensor | slice = slice(None)) -> float:
-    """Compute the largest error in `rows`, relative to the largest value of `want` in all rows; infinite for NaN."""
+    """Compute the largest error in some rows, relative to the largest value of `want`; infinite for NaN."""
     want = want.detach()
     errors = (got.detach().double().cpu() - want).abs()[rows].nan_to_num(math.inf)
     if not errors.numel():

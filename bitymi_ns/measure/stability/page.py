@@ -1,4 +1,4 @@
-"""The page docs/stability.md: errors of float32 in each case and along each kind of stiffness."""
+"""The page docs/stability.md: errors of float32 on extreme scenes."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ LIMITED, NOTHING = "as the inputs allow", "nothing drawn"  # verdicts
 
 
 class SceneErrors(NamedTuple):
-    """Errors measured on one scene."""
+    """Errors on one scene."""
 
     label: str
     single: Errors  # of the kernels in float32
@@ -46,12 +46,11 @@ class SceneErrors(NamedTuple):
 
 def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> SceneErrors:
     """Measure one scene in float32 and float64."""
-    single, double = (measure(scene, backend, dtype, near, way) for dtype in (torch.float32, torch.float64))
-    return SceneErrors(label, single, double)
+    return SceneErrors(label, *(measure(scene, backend, dtype, near, way) for dtype in (torch.float32, torch.float64)))
 
 
 def write(path: Path, backend: Backend, progress: Callable[[str], None]) -> list[SceneErrors]:
-    """Measure all cases and sweeps, write the page and its plot `<stem>.png`, and return the rows."""
+    """Measure all cases and sweeps, write the page and beside it its plot, and return the rows."""
     picture = path.with_suffix(".png") if path.name else path
     for target in (path, picture):
         check_writable(target)
@@ -92,7 +91,7 @@ CASES = ("case", "forward", "inputs", "gradient", "inputs", "worst in", "flipped
 
 
 def _inexact(rows: Sequence[SceneErrors]) -> str:
-    """Summarise the accurate cases with their largest errors, then format a line for each other case."""
+    """Summarise the accurate cases by their largest errors, and list the others."""
     rows = [row for row in rows if row.verdict != NOTHING]
     accurate = [row.single for row in rows if row.verdict == "accurate"]
     images = _short(max((e.forward for e in accurate), default=0.0))
@@ -102,9 +101,8 @@ def _inexact(rows: Sequence[SceneErrors]) -> str:
     for row in rows:
         if row.verdict != "accurate":
             e, exact = row.single, max(row.double.forward, row.double.gradient)
-            cells = [_short(error) for pair in e.pairs for error in pair]
-            cells += [e.worst, f"{100 * e.flipped:.2g} %", _short(exact), row.verdict]
-            lines.append([row.label, *cells])
+            errors = [_short(error) for pair in e.pairs for error in pair]
+            lines.append([row.label, *errors, e.worst, f"{100 * e.flipped:.2g} %", _short(exact), row.verdict])
     table = markdown.table(CASES, lines, (0, 5, len(CASES) - 1))
     return f"{text} The others:\n\n{table}" if lines else text
 
@@ -119,12 +117,12 @@ LINES = (
     ("rounded inputs, gradients", GRADIENT, "--"), ("float64 images", DOUBLE, ":"), ("float64 gradients", DOUBLE, "-."),
 )  # fmt: skip
 """Lines of a panel: label, colour, style."""
-LOWEST = 1e-17
+LOWEST = 1e-17  # error drawn
 
 
 @styled
 def _plot(groups: dict[str, list[SceneErrors]]) -> bytes:
-    """Draw the errors of each sweep over its values, stiffer to the right."""
+    """Draw the errors of each sweep, stiffer to the right."""
     figure, axes = panels([sweep.name for sweep in SWEEPS], "", "error", most=4)
     for panel, sweep in zip(axes, SWEEPS, strict=True):
         rows = groups[sweep.name]

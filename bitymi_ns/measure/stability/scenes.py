@@ -1,5 +1,4 @@
-"""Small float64 scenes for tests and measurements: random ones, numerically extreme ones, and sweeps along one kind of
-stiffness."""
+"""Small float64 scenes for tests and measurements: random, numerically extreme, and in sweeps of one stiffness."""
 
 import math
 from collections.abc import Callable
@@ -34,7 +33,7 @@ class SceneCase:
 def random_scene(
     n: int, seed: int, width: int = 48, height: int = 36, scale: float = 0.25, name: str = "random"
 ) -> SceneCase:
-    """Generate n surfels of about `scale` units at depths 2 to 6 before a camera with an oblique pose and fx != fy."""
+    """Generate n surfels of about `scale` units at depths 2 to 6 before an oblique camera with fx != fy."""
     g = torch.Generator().manual_seed(seed)
     normal = partial(torch.randn, generator=g, dtype=torch.float64)
     uniform = partial(torch.rand, generator=g, dtype=torch.float64)
@@ -61,7 +60,7 @@ def random_scene(
 def front_scene(
     n: int, seed: int, width: int = 24, height: int = 16, scale: float = 0.25, name: str = "random"
 ) -> SceneCase:
-    """Generate a random scene in front of a camera at the origin, whose frame is the world frame."""
+    """Generate a random scene before a camera whose frame is the world frame."""
     case = random_scene(n, seed, width, height, scale, name)
     case.params["means"] = case.params["means"] @ case.viewmat[:3, :3].T + case.viewmat[:3, 3]
     case.viewmat = torch.eye(4, dtype=torch.float64)
@@ -82,14 +81,14 @@ def quaternions(R: Tensor) -> Tensor:
 
 
 def rays_and_sides(means: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute the directions of the rays to centres [N, 3] from the origin, and perpendicular ones."""
+    """Compute the directions of the rays from the origin to centres [N, 3], and perpendicular ones."""
     rays = normalize(means, dim=-1)
     helper = torch.tensor([[0.3, 1.0, 0.2]], dtype=torch.float64).expand_as(rays)
     return rays, normalize(torch.linalg.cross(rays, helper), dim=-1)
 
 
 def extreme_scenes() -> list[SceneCase]:
-    """Build scenes of finite inputs that break renderers: images and gradients must be finite."""
+    """Build scenes of finite inputs that break renderers."""
     base = front_scene(12, 0)
     means, logs, quats = (base.params[key] for key in ("means", "log_scales", "quats"))
 
@@ -142,12 +141,12 @@ def extreme_scenes() -> list[SceneCase]:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Sweep along one kind of stiffness."""
+    """Scenes along one kind of stiffness, which differ in nothing else."""
 
     name: str  # short, for tables
     axis: str  # quantity with its unit
     values: tuple[float, ...]  # from easy to hard
-    make: Callable[[float], SceneCase]  # builds the scene of a value; scenes differ in that quantity only
+    make: Callable[[float], SceneCase]  # builds the scene of a value
     near: Callable[[float], float] = lambda value: 0.2  # near plane for a value
 
 
@@ -157,13 +156,12 @@ def decades(first: int, last: int) -> tuple[float, ...]:
     return tuple(10.0**k for k in range(first, last + step, step))
 
 
-def _small(seed: int, scale: float = 0.25) -> SceneCase:
-    return front_scene(16, seed, scale=scale)
+small = partial(front_scene, 16)
 
 
 def _edge_on(angle: float) -> SceneCase:
     """Build discs whose planes make this angle with the ray through their centres."""
-    base = _small(0, scale=0.5)
+    base = small(0, scale=0.5)
     ray, side = rays_and_sides(base.params["means"])
     along = math.cos(angle) * ray + math.sin(angle) * torch.linalg.cross(side, ray)
     rotation = torch.stack([along, side, torch.linalg.cross(along, side)], dim=-1)
@@ -172,12 +170,12 @@ def _edge_on(angle: float) -> SceneCase:
 
 def _camera_plane(depth: float) -> SceneCase:
     """Build discs of scale 0.5 with centres at 0.5 to 1.5 times this depth, in scales."""
-    base = _small(1, scale=0.5)
+    base = small(1, scale=0.5)
     return changed(base, means=base.params["means"] * (0.5 * depth / 4.0))
 
 
 def _axis_ratio(ratio: float) -> SceneCase:
-    base = _small(4, scale=0.8)
+    base = small(4, scale=0.8)
     logs = base.params["log_scales"][:, :1]
     return changed(base, log_scales=torch.cat([logs, logs - math.log(ratio)], 1))
 
@@ -197,26 +195,15 @@ def _layers(count: float) -> SceneCase:
     return changed(front_scene(int(count), 7, 8, 6, scale=2.0), opacity_logits=math.log(opacity / (1 - opacity)))
 
 
-def _beta(beta: float) -> SceneCase:
-    return changed(_small(2), beta_raw=math.log(beta) - math.log(4 - beta))
-
-
-def _temperature(tau: float) -> SceneCase:
-    return changed(_small(3), sv_log_tau=math.log(tau))
-
-
-def _opacity(clear: float) -> SceneCase:
-    return changed(_small(6), opacity_logits=math.log1p(-clear) - math.log(clear))
-
-
+BETAS, CLEAR = (3.9, 1.0, *decades(-1, -7)), (0.5, *decades(-1, -7))
 SWEEPS = (
     Sweep("edge-on", "angle between ray and disc [rad]", decades(0, -7), _edge_on),
     Sweep("camera plane", "depth of the centres / scale", decades(1, -6), _camera_plane, near=lambda d: 0.05 * d),
-    Sweep("beta", "beta", (3.9, 1.0, *decades(-1, -7)), _beta),
-    Sweep("temperature", "temperature", decades(0, 6), _temperature),
+    Sweep("beta", "beta", BETAS, lambda beta: changed(small(2), beta_raw=math.log(beta) - math.log(4 - beta))),
+    Sweep("temperature", "temperature", decades(0, 6), lambda tau: changed(small(3), sv_log_tau=math.log(tau))),
     Sweep("axis ratio", "axis ratio", decades(0, 6), _axis_ratio),
     Sweep("world size", "distance from the origin / size of the scene", decades(0, 6), _world),
-    Sweep("opacity", "1 - opacity", (0.5, *decades(-1, -7)), _opacity),
+    Sweep("opacity", "1 - opacity", CLEAR, lambda p: changed(small(6), opacity_logits=math.log1p(-p) - math.log(p))),
     Sweep("layers", "layers", (1, 4, 16, 64, 256, 1024), _layers),
 )
 
@@ -233,11 +220,11 @@ class Way:
     """A rendering mode, measured on the same scenes."""
 
     name: str  # short, for tables and tests
-    texels: bool = False  # each surfel has a tile of random texels; gradients reach them and, by the fetch, u and v
+    texels: bool = False  # each surfel has a tile of random texels
     alpha: bool = False  # the texels have random alphas from 0 to 2, without a weight bound
 
     def of(self, case: SceneCase) -> SceneCase:
-        """Add random texels to a case if this mode has texels."""
+        """Add the texels to a case."""
         if not self.texels:
             return case
         n = len(case.params["means"])
@@ -249,7 +236,7 @@ class Way:
 
 
 PLAIN = Way("plain")
-WAYS = (Way(TEXELS, texels=True), Way("alpha", texels=True, alpha=True))  # rendering modes besides PLAIN
+WAYS = (Way(TEXELS, texels=True), Way("alpha", texels=True, alpha=True))
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:
@@ -265,8 +252,8 @@ def tile_images(texels: Tensor) -> list[Tensor]:
 
 
 def cells(uv: Tensor) -> Tensor:
-    """Find the cell between texel centres that coordinates [..., 2] lie in: index [...] int64, or -1 if rounding
-    decides it. The slope of the bilinear fetch changes between cells."""
+    """Find the cell between texel centres, where the slope of the bilinear fetch is constant, of coordinates [..., 2]:
+    index [...] int64, or -1 if rounding decides it."""
     size = torch.tensor(TILE, dtype=torch.float64, device=uv.device)
     at = (uv.detach().double().clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # -0.5 to size - 0.5
     column, row = (at.floor().long() + 1).unbind(-1)

@@ -21,14 +21,13 @@ from bitymi_ns.trust import check_replaceable
 from .room import Room
 
 FOCAL = 0.80  # focal length in image widths
-TARGET = np.array([0.0, 0.0, 0.72])
 BAND = 1 << 16  # rays traced at a time
 CAPTURE, CLOUD = "transforms.json", "sparse_pc.ply"
 MADE_BY = "bitymi sample"  # marks transforms.json: only folders with this mark are overwritten
 
 
 class RoomView(NamedTuple):
-    """One pinhole camera: camera-to-world [4, 4] with OpenGL axes (x right, y up, z backward), pixel intrinsics."""
+    """A pinhole camera: camera-to-world [4, 4] with OpenGL axes (x right, y up, z backward), pixels."""
 
     camera_to_world: NDArray[np.float64]
     focal: float
@@ -55,7 +54,7 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 
 
 def camera_path(views: int, width: int, height: int, seed: int) -> list[RoomView]:
-    """Generate two orbits around the objects at varying heights, with random offsets of the cameras' targets."""
+    """Generate two orbits around the objects, at varying heights, towards targets with random offsets."""
     rng = np.random.default_rng([seed, 1])
     path = []
     for k in range(views):
@@ -64,7 +63,7 @@ def camera_path(views: int, width: int, height: int, seed: int) -> list[RoomView
         reach = 1 + 0.10 * np.sin(7 * 2 * np.pi * s)
         eye = np.array([2.25 * reach * np.cos(angle), 1.75 * reach * np.sin(angle), 0.0])
         eye[2] = (0.75 if s < 0.5 else 1.55) + 0.30 * np.sin(5 * 2 * np.pi * s)
-        target = TARGET + rng.uniform(-0.25, 0.25, 3)
+        target = [0.0, 0.0, 0.72] + rng.uniform(-0.25, 0.25, 3)
         path.append(RoomView(look_at(eye, target), FOCAL * width, width, height))
     return path
 
@@ -91,16 +90,15 @@ def first_hits(
 def sparse_points(
     room: Room, views: list[RoomView], images: list[NDArray[np.uint8]], count: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Sample exact surface points [count, 3] and their pixels' colors [count, 3]: as many per view, more where it has
-    corners, as structure from motion finds them (by the root of a pixel's smaller eigenvalue)."""
+    """Sample exact surface points [count, 3] and their pixels' colors [count, 3], more where a view has corners, as
+    structure from motion finds them (by the root of a pixel's smaller eigenvalue)."""
     rng = np.random.default_rng([seed, 2])
     points, colors = [], []
     shares = np.diff(np.linspace(0, count, len(views) + 1).astype(int))
     for view, image, share in zip(views, images, shares, strict=True):
         corners = cv2.cornerMinEigenVal(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), 3).ravel().astype(float)
         weights = np.sqrt(np.maximum(corners, 1e-3 * corners.max() + 1e-12))  # eigenvalues round below 0
-        replace = share > len(weights)
-        pixels = rng.choice(len(weights), size=share, replace=replace, p=weights / weights.sum())
+        pixels = rng.choice(len(weights), share, replace=share > len(weights), p=weights / weights.sum())
         points.append(first_hits(room, view, pixels)[0])
         colors.append(image.reshape(-1, 3)[pixels])
     return np.concatenate(points), np.concatenate(colors)
@@ -116,10 +114,9 @@ def generate(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
-    """Write transforms.json (one shared pinhole camera, exact poses), images/frame_00001.png etc. and sparse_pc.ply to
-    `output_dir`, whole or not at all, and return that folder. Equal arguments give equal files. Raises ValueError: an
-    argument is too small; FileExistsError: the folder holds files that are not a sample's, or `overwrite` is False;
-    NotADirectoryError: it is a file."""
+    """Write transforms.json (one pinhole camera, exact poses), images and sparse_pc.ply to a folder, whole or not at
+    all, and return it. Equal arguments give equal files. Raises ValueError: an argument is too small; FileExistsError:
+    the folder holds other files, or `overwrite` is False; NotADirectoryError: it is a file."""
     limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
     for name, (value, least) in limits.items():
         if value < least:
@@ -127,21 +124,29 @@ def generate(
     output_dir = Path(output_dir).absolute()
 
     def check() -> None:
-        check_replaceable(output_dir, "a sample capture", _files_of(output_dir), overwrite, FileExistsError)
+        """Check that the folder holds nothing, or an earlier sample alone."""
+        files = None
+        with suppress(FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
+            if read_json(output_dir / CAPTURE).get("made_by") == MADE_BY:
+                images = (output_dir / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
+                files = [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)]
+        check_replaceable(output_dir, "a sample capture", files, overwrite, FileExistsError)
 
     path, done = camera_path(views, width, height, seed), count(1)
+    names = [f"images/frame_{k + 1:05d}.png" for k in range(views)]
     with complete_folder(output_dir, check) as new:
         (new / "images").mkdir()
         room = Room(seed)
 
         def frame(k: int) -> NDArray[np.uint8]:
             image = render(room, path[k])
-            PILImage.fromarray(image).save(new / _image(k))
+            PILImage.fromarray(image).save(new / names[k])
             progress("Rendering the sample room", next(done), views)
             return image
 
         write_cloud(new / CLOUD, *sparse_points(room, path, in_threads(frame, range(views)), points, seed))
-        frames = [{"file_path": _image(k), "transform_matrix": v.camera_to_world.tolist()} for k, v in enumerate(path)]
+        poses = [view.camera_to_world.tolist() for view in path]
+        frames = [{"file_path": name, "transform_matrix": p} for name, p in zip(names, poses, strict=True)]
         meta = {
             **{"made_by": MADE_BY, "camera_model": "OPENCV", "w": width, "h": height},
             **{"fl_x": FOCAL * width, "fl_y": FOCAL * width, "cx": width / 2, "cy": height / 2},
@@ -150,16 +155,3 @@ def generate(
         }
         (new / CAPTURE).write_text(json.dumps(meta, indent=1) + "\n", encoding="utf-8")
     return output_dir
-
-
-def _image(k: int) -> str:
-    return f"images/frame_{k + 1:05d}.png"
-
-
-def _files_of(folder: Path) -> list[str] | None:
-    """List the files of a sample; None: the folder is none."""
-    with suppress(FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
-        if read_json(folder / CAPTURE).get("made_by") == MADE_BY:
-            images = (folder / "images").glob("frame_[0-9][0-9][0-9][0-9][0-9].png")
-            return [CAPTURE, CLOUD, *(f"images/{path.name}" for path in images)]
-    return None

@@ -1,8 +1,7 @@
-"""The sample room and its ray tracer, in numpy.
+"""The sample room and its ray tracer.
 
 World frame: metres, x and y along the floor, z up. Points and directions of n rays are float32 [3, n], origins also
-[3, 1]; t [n] is in units of the direction's length, surfaces [n] are int8. Lighting of walls and floor is baked into
-their textures; sphere and box are glossy. Colors are display values in [0, 1]."""
+[3, 1]; t [n] is in units of the direction's length, surfaces [n] are int8. Colors are display values in [0, 1]."""
 
 from functools import partial
 
@@ -26,18 +25,16 @@ SIDES = (
 """Painters and posters (width, height, kind, left and bottom edge) of x low, x high, y low, y high, floor, ceiling."""
 AXES = ((0, 1, 2), (0, 1, 2), (1, 0, 2), (1, 0, 2), (2, 0, 1), (2, 0, 1), (1, 0, 2))
 """World axes of each side's normal, and of its texture's u and v; of the landscape, too."""
-MIRRORED = (1, 2)  # sides whose u runs against its axis, so that it points right for a viewer inside the room
+MIRRORED = (1, 2)  # sides whose u runs against its axis, to the right for a viewer
 WINDOW = (-1.3, 1.1, 0.75, 2.15)  # x0, x1, z0, z1 of the opening in the wall y = HIGH[1]
-OUTSIDE = np.array([[-40.0], [30.0], [-5.0]], np.float32), np.array([[40.0], [30.0], [15.0]], np.float32)
-"""Lower left and upper right corner of the landscape image."""
+OUTSIDE = np.array([[[-40.0], [30.0], [-5.0]], [[40.0], [30.0], [15.0]]], np.float32)  # corners of the landscape
 LAMP = (-0.6, 0.9, -0.7, 0.1)  # x0, x1, y0, y1 of the light in the ceiling
 YAW_COS, YAW_SIN = np.cos(np.float32(0.5)), np.sin(np.float32(0.5))
 NEAR = np.float32(1e-4)
 
 
 class Solid:
-    """Box, turned about its middle with `yaw`, or with `axes` the ball (3) or upright pole (2) in it. Corners (of a
-    turned box from its center), center and half sides are [3, 1]."""
+    """Box, turned about its middle with `yaw`, or with `axes` the ball (3) or upright pole (2) in it."""
 
     def __init__(
         self, *sides: float, color: tuple[float, ...] | str, gloss: float = 0.0, axes: int = 0, yaw: bool = False
@@ -46,9 +43,9 @@ class Solid:
         low, high = np.reshape(sides, (3, 2, 1)).transpose(1, 0, 2)
         center, half = (low + high) / 2, (high - low) / 2
         low, high = (-half, half) if yaw else (low, high)
-        self.low, self.high, self.center, self.half = (part.astype(np.float32) for part in (low, high, center, half))
-        self.radius = float(half[0, 0])
-        self.reach = self.half * np.float32(1.6 if yaw else 1.0001)  # half sides of its bounds
+        self.low, self.high, self.center, half = (part.astype(np.float32) for part in (low, high, center, half))
+        self.radius = float((sides[1] - sides[0]) / 2)
+        self.reach = half * np.float32(1.6 if yaw else 1.0001)  # half sides of its bounds
         self.color, self.gloss, self.axes, self.yaw = color, gloss, axes, yaw
 
     def enter(self, o: Image, d: Image, inverse: Image) -> tuple[Image, np.ndarray]:
@@ -66,7 +63,7 @@ class Solid:
         return near, near < far
 
     def normals(self, p: Image) -> tuple[Image, Image, Image]:
-        """Compute outward normals [3, n] of points on the surface, and coordinates u, v in [0, 1] on a box's faces."""
+        """Compute outward normals [3, n] of points on the surface, and u, v in [0, 1] on a box's faces."""
         if self.axes:
             normal = (p - self.center) / np.float32(self.radius)
             normal[self.axes :] = 0
@@ -82,7 +79,7 @@ class Solid:
 
 _X, _Z = (WINDOW[0] + WINDOW[1]) / 2, (WINDOW[2] + WINDOW[3]) / 2
 _FRAME = float(HIGH[1, 0]) - 0.03, float(HIGH[1, 0])
-GROUPS = (
+GROUPS = (  # of solids that are near each other
     [Solid(-0.91, -0.19, -0.26, 0.46, 0.44, 1.16, color=(0.16, 0.20, 0.30), gloss=0.55, axes=3)],
     [Solid(1.18, 1.32, -1.02, -0.88, 1.30, 1.44, color=(0.85, 0.15, 0.10), axes=3)],
     [Solid(0.33, 0.97, -0.31, 0.21, 0.0, 0.76, color="box", gloss=0.10, yaw=True)],
@@ -101,13 +98,12 @@ GROUPS = (
         Solid(*WINDOW[:2], *_FRAME, _Z - 0.015, _Z + 0.015, color=(0.92, 0.92, 0.90)),
     ],
 )  # fmt: skip
-"""Solids that are near each other."""
 SOLIDS = [solid for group in GROUPS for solid in group]
 LANDSCAPE, FIRST = 6, 7  # surfaces, after those of SIDES; from FIRST on SOLIDS
 
 
 class Room:
-    """The room's textures, generated from a seed, and its ray tracer."""
+    """Textures of a room, and their ray tracer."""
 
     def __init__(self, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -132,7 +128,7 @@ class Room:
         self.textures = {"box": box, "plinth": textures.poster(rng, 0.6, 0.44, "bars")}
 
     def _light_map(self, side: int, rng: np.random.Generator, n: int = 96, samples: int = 48) -> Image:
-        """Compute the light map [n, n, 3] of one side of the room: ambient light and the lamp with soft shadows."""
+        """Compute the light map [n, n, 3] of one side: ambient light, and the lamp with soft shadows."""
         v, u = np.meshgrid(*[(np.arange(n, dtype=np.float32) + 0.5) / n] * 2, indexing="ij")
         axes, u = list(AXES[side]), 1 - u if side in MIRRORED else u
         share, normal = np.empty((3, n * n), np.float32), np.zeros((3, 1), np.float32)
@@ -185,7 +181,7 @@ class Room:
         return result
 
     def _solid_color(self, solid: Solid, p: Image, d: Image, mirrors: bool) -> Image:
-        """Compute colors [n, 3] of points p [3, n] on a solid, viewed along d [3, n]."""
+        """Compute colors [n, 3] of points on a solid, viewed along d."""
         normal, u, v = solid.normals(p)
         if solid.color == "stripes":
             base = np.array([[0.85, 0.20, 0.15], [0.85, 0.85, 0.82]], np.float32)[(p[2] * 8).astype(int) % 2]
@@ -209,7 +205,7 @@ class Room:
 
 
 def _nearer(o: Image, d: Image, t: Image, surfaces: np.ndarray) -> tuple[Image, np.ndarray]:
-    """Replace, in place, t and surfaces of rays that meet a solid before."""
+    """Replace t and surfaces, in place, of rays that meet a solid before."""
     number = FIRST
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         inverse = np.float32(1) / d

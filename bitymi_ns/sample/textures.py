@@ -1,8 +1,6 @@
-"""Procedural textures of the sample room, generated once as images and sampled bilinearly.
+"""Procedural textures of the sample room: float32 [h, w, 3] in [0, 1], whose row 0 is v = 0 and column 0 is u = 0.
 
-A texture is float32 [h, w, 3] in [0, 1]. Row 0 is v = 0 and column 0 is u = 0, both at the texel's centre. Painters of
-sides take coordinates x and y [h, w] in metres.
-"""
+Painters of sides take coordinates x and y [h, w] in metres."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +26,7 @@ def lookup(texture: Image, u: Image, v: Image) -> Image:
 
 
 def resize(image: Image, height: int, width: int) -> Image:
-    """Resample an image [h, w] or [h, w, c] bilinearly to [height, width] or [height, width, c], edges clamped."""
+    """Resample an image [h, w] or [h, w, c] bilinearly, edges clamped."""
     for size in (height, width):
         n = len(image)
         low, f = _texels((np.arange(size, dtype=np.float32) + 0.5) * np.float32(n / size), n)
@@ -45,7 +43,7 @@ def grid(width_m: float, height_m: float) -> tuple[Image, Image]:
 
 
 def noise(rng: np.random.Generator, shape: tuple[int, ...], cells: tuple[int, int], octaves: int = 4) -> Image:
-    """Generate fractal value noise [h, w] of about [0, 1]; `cells` are rows and columns of the coarsest octave."""
+    """Generate fractal value noise [h, w] of about [0, 1]. `cells`: rows and columns of the coarsest octave."""
     total = np.zeros(shape, np.float32)
     for octave in range(octaves):
         rows, columns = cells[0] * 2**octave + 1, cells[1] * 2**octave + 1
@@ -60,7 +58,7 @@ def mix(a: Image | tuple[float, ...], b: Image | tuple[float, ...], t: Image) ->
 
 
 def wood_tiles(rng: np.random.Generator, x: Image, y: Image) -> Image:
-    """Paint square wooden tiles, light and dark like a chessboard, with alternating grain direction."""
+    """Paint light and dark wooden tiles like a chessboard."""
     tile = 0.5
     i, j = (x / tile).astype(int), (y / tile).astype(int)
     odd = (i + j) % 2 == 1
@@ -108,8 +106,7 @@ def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, mar
     letters = rng.random((26, 7, 3)) < 0.55
     letters = np.concatenate([letters, letters[:, :, 1::-1]], axis=2)  # mirrored: they look drawn, not random
     letters[:, :, 0] |= rng.random((26, 1)) < 0.5
-    # v points up on walls, so a letter's first row comes last
-    letters = letters[:, ::-1].repeat(texel, 1).repeat(texel, 2)
+    letters = letters[:, ::-1].repeat(texel, 1).repeat(texel, 2)  # v points up
     h, w = image.shape[:2]
     edge = round(margin * TEXELS_PER_METRE)
     for top in range(edge, h - edge - 7 * texel, 10 * texel):
@@ -117,7 +114,7 @@ def print_text(rng: np.random.Generator, image: Image, glyph: float = 0.045, mar
         if rng.random() < 0.25:
             end = round(end * rng.uniform(0.4, 0.9))
         for left in range(edge, end, 6 * texel):
-            if (letter := rng.integers(0, 32)) < 26:  # the others are spaces between words
+            if (letter := rng.integers(0, 32)) < 26:  # else a space
                 image[top : top + 7 * texel, left : left + 5 * texel][letters[letter]] = (0.08, 0.07, 0.10)
 
 
@@ -145,7 +142,7 @@ def poster(rng: np.random.Generator, width_m: float, height_m: float, kind: str)
 def landscape(rng: np.random.Generator) -> Image:
     """Paint the landscape outside the window, [512, 2048, 3] over 80 by 20 metres."""
     h, w = 512, 2048
-    v, u = np.meshgrid(np.linspace(0, 1, h, dtype=np.float32), np.linspace(0, 1, w, dtype=np.float32), indexing="ij")
+    v = np.linspace(0, 1, h, dtype=np.float32)[:, None]
     cloud = noise(rng, (h, w), (5, 14), 5)
     image = mix((0.80, 0.88, 0.95), (0.30, 0.52, 0.86), np.clip((v - 0.35) * 1.6, 0, 1))
     image = mix(image, (0.98, 0.98, 0.98), np.clip((cloud - 0.5) * 4, 0, 1))
@@ -154,13 +151,13 @@ def landscape(rng: np.random.Generator) -> Image:
         ridge = level + 0.12 * (noise(rng, (2, w), (1, 6 + 5 * k), 4)[:1] - 0.5)
         shade = 0.7 + 0.6 * noise(rng, (h, w), (20, 60), 3)
         image = np.where((v < ridge)[..., None], np.asarray(color, np.float32) * shade[..., None], image)
-    for _ in range(60):
+    for _ in range(60):  # trees
         x, y, r = rng.uniform(0, w), rng.uniform(60, 150), rng.uniform(8, 20)
         place = (slice(int(y - r), int(y + r)), slice(max(0, int(x - r)), min(w, int(x + r))))
         yy, xx = np.ogrid[place]
         crown = (xx - x) ** 2 + (yy - y) ** 2 < (r * rng.uniform(0.7, 1.0)) ** 2
         image[place][crown] = np.array([0.10, 0.28, 0.10], np.float32) * rng.uniform(0.7, 1.5)
-    for _ in range(14):
+    for _ in range(14):  # houses
         x, y, s = int(rng.uniform(0, w - 80)), int(rng.uniform(60, 120)), int(rng.uniform(24, 44))
         image[y : y + s, x : x + int(1.4 * s)] = rng.uniform(0.6, 0.95, 3)
         image[y + s : y + s + s // 3, x - 3 : x + int(1.4 * s) + 3] = (0.55, 0.18, 0.12)

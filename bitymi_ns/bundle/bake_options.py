@@ -22,8 +22,8 @@ class BakeOptions:
 
     format: BundleFormat | None = None
     """compact: surfels and view colours quantised as far as the pictures allow, texels by cosine transform; a sixth to
-    a half of the bytes of bc7, which is surfels.ply and texels of 1 byte each. uint8, fp16: as bc7, with texels of 4
-    and 8 bytes. None: compact, or bc7 for a tolerance of 0, which keeps everything."""
+    a half of the bytes of bc7: surfels.ply and texels of 1 byte. uint8, fp16: texels of 4 and 8 bytes. None: compact,
+    or bc7 for a tolerance of 0."""
     bc7_profile: Profile = "veryfast"
     """Effort of the BC7 encoder; basic and slow gain about 0.3 dB at a quarter and a twelfth of the speed."""
     r_min: int = 4
@@ -31,17 +31,16 @@ class BakeOptions:
     r_max: int = 64
     """Largest tile side in texels, a power of two."""
     extent: Annotated[float, Field(ge=EXTENTS[0], le=EXTENTS[1])] = SUPPORT
-    """Largest half side of a tile in scale units (the paper's e, 4 there); 3 covers exactly the kernel's support. With
-    a tolerance a tile covers only fragments above the weight bound."""
+    """Largest half side of a tile in scale units (the paper's e, 4 there); 3 is the kernel's support. With a tolerance
+    a tile covers only fragments above the weight bound."""
     tolerance: Annotated[float, Field(ge=0, lt=STEPS)] = 0.75
     """Largest error of the reduction, in 8-bit steps, weighted by a fragment's largest contribution to a pixel. A tile
     takes the smallest grid, or none, whose root mean square error over its visible part is within it. A view colour
-    keeps the fewest Spherical Voronoi sites, or one colour, whose largest error is within it, over the directions of
-    the training views that see the surfel and others between and around them. (Other view colours keep everything or
-    one colour.) 0: tile sizes by the Nyquist rule, view colours unchanged."""
+    keeps the fewest Spherical Voronoi sites, or one colour (other kinds: everything or one colour), whose largest error
+    is within it, over directions in and around the training views that see the surfel. 0: tile sizes by the Nyquist
+    rule, view colours unchanged."""
     local_voxel: bool = True
-    """Choose the size of a tile by the field's voxels at the surfel; False: by the smallest voxel of the scene, as in
-    the paper."""
+    """Choose the size of a tile by the field's voxels at the surfel; False: by its smallest, as in the paper."""
     cap_by_views: bool = True
     """Limit the texels of a tile to the pixels it covers in the training view that sees it largest."""
     drop_unseen: bool = True
@@ -66,7 +65,7 @@ class BakeOptions:
 
     @property
     def texel_format(self) -> Format:
-        """Format of the atlas in memory: compact texels are decoded to 8 bits, without an encoder."""
+        """Format of the atlas in memory: compact texels are decoded to 8 bits."""
         return "uint8" if self.bundle_format == "compact" else self.bundle_format
 
     def check(self) -> None:
@@ -82,7 +81,7 @@ class BakeOptions:
                 f"tiles of r_max = {self.r_max} texels do not fit pages of {self.page_width} x {self.page_rows} texels"
             )
         if self.format == "compact" and self.tolerance == 0:
-            raise ValueError("a compact bundle needs a tolerance above 0: choose another format, or another tolerance")
+            raise ValueError("a compact bundle needs a tolerance above 0: choose another format or tolerance")
         if self.texel_format == "bc7":
             bc7_encoder(self.bc7_profile)
         elif self.bc7_profile != BakeOptions.bc7_profile:

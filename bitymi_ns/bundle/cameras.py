@@ -30,8 +30,8 @@ class CapturedCamera(BaseModel):
     """A camera of the capture, and its photograph: size, focal lengths and principal point in pixels.
 
     `viewmat`: [16] world to camera by rows, OpenCV axes. `photograph`: file of the bundle, possibly reduced.
-    `correction`: maps colours of the scene, but not the background, to the photograph's: 3 gains, or 12 numbers, matrix
-    and offset [3, 4] by rows; None: mean exposure."""
+    `correction`: maps colours of the scene, but not the background, to the photograph's: 3 gains, or matrix and offset
+    [3, 4] by rows; None: mean exposure."""
 
     name: str
     held_out: bool
@@ -50,19 +50,27 @@ class CapturedCamera(BaseModel):
         cls, name: str, camera: Camera, held_out: bool, photograph: str | None = None, correction: Tensor | None = None
     ) -> "CapturedCamera":
         (fx, _, cx), (_, fy, cy), _ = camera.K.cpu().tolist()
-        size = {"width": camera.width, "height": camera.height}
-        viewmat = camera.viewmat.cpu().flatten().tolist()
-        of_lens = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-        of_photograph = {"photograph": photograph, "correction": None}
-        if correction is not None:
-            of_photograph["correction"] = correction.cpu().flatten().tolist()
-        return cls(name=name, held_out=held_out, **size, **of_lens, viewmat=viewmat, **of_photograph)
+        return cls(
+            name=name,
+            held_out=held_out,
+            width=camera.width,
+            height=camera.height,
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            viewmat=camera.viewmat.cpu().flatten().tolist(),
+            photograph=photograph,
+            correction=None if correction is None else correction.cpu().flatten().tolist(),
+        )
 
     @property
     def exposure(self) -> Tensor | None:
         """Convert the correction to gains [3] or matrix and offset [3, 4]."""
-        found = None if self.correction is None else torch.tensor(self.correction, dtype=torch.float32)
-        return found if found is None or len(found) == 3 else found.view(3, 4)
+        if self.correction is None:
+            return None
+        numbers = torch.tensor(self.correction, dtype=torch.float32)
+        return numbers if len(numbers) == 3 else numbers.view(3, 4)
 
     @property
     def camera(self) -> Camera:
@@ -76,18 +84,18 @@ def cameras_data(cameras: Iterable[CapturedCamera]) -> bytes:
 
 
 def parse_cameras(data: bytes | bytearray, path: Path) -> list[CapturedCamera]:
-    """Parse cameras.json. `path`: path for messages. Raises BundleError: malformed; names the first bad entry."""
+    """Parse cameras.json. `path`: for messages. Raises BundleError: names the first bad entry."""
     try:
         value = strict_json.loads(data)
     except ValueError as error:
         raise BundleError(f"{path} cannot be read as JSON ({error})") from error
-    found = value.get("cameras") if isinstance(value, dict) else None
-    if not isinstance(found, list) or len(found) > MOST_CAMERAS:
+    entries = value.get("cameras") if isinstance(value, dict) else None
+    if not isinstance(entries, list) or len(entries) > MOST_CAMERAS:
         raise BundleError(f"{path} must have a list cameras, of at most {MOST_CAMERAS:,}")
     rows = []
-    for number, row in enumerate(found):
+    for number, entry in enumerate(entries):
         try:
-            rows.append(CapturedCamera.model_validate(row))
+            rows.append(CapturedCamera.model_validate(entry))
         except ValidationError as error:
             where, what = first_problem(error)
             raise BundleError(f"{path}: {'.'.join(filter(None, (f'cameras.{number}', where)))}: {what}") from error

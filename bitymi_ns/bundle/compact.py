@@ -1,5 +1,5 @@
 """surfels.bin and texels.bin of a compact bundle: integer columns described by bundle.json. A `digest` takes their
-integers, little-endian int64 in order, for `Manifest.decoded`."""
+integers, little-endian int64, for `Manifest.decoded`."""
 
 from __future__ import annotations
 
@@ -24,9 +24,8 @@ if TYPE_CHECKING:
     from hashlib import _Hash as Digest
 
 SURFELS_PER_BYTE, TEXELS_PER_BYTE = 1, 64
-"""Upper bounds, plus `SPARE_*`, on what a file may claim: constant columns take no bytes on disk, but memory. Trained
-scenes have a surfel per 12 bytes or more and at most 5 texels per byte. Flat tiles take bytes in surfels.bin only, so
-the sum of both files counts for texels."""
+"""Upper bounds, plus `SPARE_*`, on what a file may claim: constant columns take memory, but no bytes on disk. Trained
+scenes have a surfel per 12 bytes or more, and at most 5 texels per byte of both files."""
 SPARE_SURFELS, SPARE_TEXELS = 1 << 12, 1 << 20
 MOST_EXPONENT = 12  # largest log2 of a tile side
 MOST_COEFFICIENT = 1 << 24
@@ -35,8 +34,8 @@ MOST_COEFFICIENT = 1 << 24
 def encode_surfels(
     codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None, digest: Digest
 ) -> tuple[dict[str, Any], bytes]:
-    """Encode surfels.bin; returns its entries in bundle.json and its bytes. `residual`: [N, 3] mean residuals in steps:
-    green, red - green, blue - green. `alpha`: [N] mean alphas, 128 = 1; None if opaque."""
+    """Encode surfels.bin; returns its entries in bundle.json and its bytes. `residual`: [N, 3] mean residuals in steps
+    (green, red - green, blue - green). `alpha`: [N] mean alphas, 128 = 1; None: opaque."""
     columns = {**codes.columns, "residual": residual}
     if alpha is not None:
         columns["alpha"] = alpha[:, None]
@@ -50,8 +49,8 @@ def encode_surfels(
 def decode_surfels(
     info: Surfels, data: memoryview, has_alpha: bool = False, digest: Digest | None = None
 ) -> tuple[SurfelCodes, Codes, float, Codes | None]:
-    """Decode surfels.bin: the codes, the residuals [N, 3] and their step, and mean alphas [N] if it has them. Raises
-    StreamError: the file is damaged, contradicts bundle.json, or holds a number out of range."""
+    """Decode surfels.bin to the codes, the residuals [N, 3] and their step, and mean alphas [N]. Raises StreamError:
+    the file is damaged, contradicts bundle.json, or holds a number out of range."""
     assert info.columns is not None and info.frame is not None
     numbers = columns_of(info.view_color, has_alpha, [column.name for column in info.columns])
     steps = _check_columns(info.columns, numbers, (*REFERENCE, "residual"))
@@ -95,9 +94,9 @@ def _compressed(
 ) -> tuple[list[dict[str, Any]], bytes]:
     for values in columns.values():
         digest.update(np.ascontiguousarray(values, "<i8").data)
-    found = {name: streams.compress(values) for name, values in columns.items()}
-    entries = [{"name": name, "step": steps.get(name), "bytes": c.sizes} for name, c in found.items()]
-    return entries, b"".join(c.data for c in found.values())
+    coded = {name: streams.compress(values) for name, values in columns.items()}
+    entries = [{"name": name, "step": steps.get(name), "bytes": column.sizes} for name, column in coded.items()]
+    return entries, b"".join(column.data for column in coded.values())
 
 
 def _decompressed(data: memoryview, rows: int, column: ColumnEntry, digest: Digest | None, blocks: int = 0) -> Codes:
@@ -116,8 +115,8 @@ def decode_texels(
     alpha: Codes | None = None,
     digest: Digest | None = None,
 ) -> TexelCodes:
-    """Decode texels.bin, with tile sides [N, 2] and residuals, their step and mean alphas (None if opaque) from
-    surfels.bin. Raises StreamError: the file is damaged or contradicts bundle.json or the tile sizes."""
+    """Decode texels.bin, with what `decode_surfels` returned; `sizes`: [N, 2] tile sides. Raises StreamError: the file
+    is damaged or contradicts bundle.json or the tile sizes."""
     assert info.columns is not None and info.step is not None and info.texels is not None
     count = int(sizes.prod(dim=1).sum())
     if count != info.texels:
@@ -135,27 +134,26 @@ def decode_texels(
     if tiles and not (GRADES[0] <= grades.min() and grades.max() <= GRADES[1]):
         raise StreamError(f"a grade is not from {GRADES[0]} to {GRADES[1]}")
     coefficients = []
-    for each, column, part in zip([*blocks, *blocks[: len(alphas)]], info.columns[1:], parts, strict=True):
-        values = _decompressed(part, each.texels.numel(), column, digest, len(each.texels))
+    for group, column, part in zip([*blocks, *blocks[: len(alphas)]], info.columns[1:], parts, strict=True):
+        values = _decompressed(part, group.texels.numel(), column, digest, len(group.texels))
         if np.abs(values).max(initial=0) > MOST_COEFFICIENT:
             raise StreamError(f"a coefficient of {column.name} is beyond {MOST_COEFFICIENT}")
         narrow = torch.from_numpy(values.astype(np.int32, order="C"))
-        coefficients.append(narrow.view(-1, len(each.texels), values.shape[1]))
+        coefficients.append(narrow.view(-1, len(group.texels), values.shape[1]))
     coded = None if alpha is None else AlphaCodes(alpha, steps.pop() if steps else 1.0, coefficients[len(blocks) :])
     colors = coefficients[: len(blocks)]
     return TexelCodes(sizes, info.step, residual, residual_step, torch.from_numpy(grades), colors, coded)
 
 
 def packing_of(info: AtlasEntry, sizes: Tensor) -> Packing:
-    """Lay out the tiles in pages, which follows from their sizes. Raises StreamError: the pages differ from
-    bundle.json's."""
+    """Lay out the tiles of these sizes [N, 2] in pages. Raises StreamError: the pages differ from bundle.json's."""
     try:
         packing = pack(sizes.numpy(), info.page_width or 0, info.page_rows or 0)
     except ValueError as error:
         raise StreamError(str(error)) from error
-    found = (packing.width, packing.height, packing.layers)
-    if found != (info.width, info.height, info.layers):
-        raise StreamError(f"the tiles make pages {found}, width, height and layers of the atlas are others")
+    pages = (packing.width, packing.height, packing.layers)
+    if pages != (info.width, info.height, info.layers):
+        raise StreamError(f"the tiles make pages {pages}, width, height and layers of the atlas are others")
     return packing
 
 
@@ -179,14 +177,14 @@ def check_size(info: Manifest, name: str, size: int) -> None:
 def _check_columns(
     columns: Sequence[ColumnEntry], numbers: Mapping[str, int], stepped: Sequence[str]
 ) -> dict[str, float]:
-    found = [column.name for column in columns]
-    if found != list(numbers):
-        raise StreamError(f"the columns are {found}, not {list(numbers)}")
+    names = [column.name for column in columns]
+    if names != list(numbers):
+        raise StreamError(f"the columns are {names}, not {list(numbers)}")
     steps = {}
     for column in columns:
-        if len(column.bytes) != numbers[column.name]:
-            wanted = f"{numbers[column.name]} numbers, not {len(column.bytes)}"
-            raise StreamError(f"the column {column.name} needs {wanted}")
+        count, given = numbers[column.name], len(column.bytes)
+        if given != count:
+            raise StreamError(f"the column {column.name} needs {count} numbers, not {given}")
         if column.name in stepped:
             if column.step is None:
                 raise StreamError(f"the column {column.name} has no step")
@@ -195,7 +193,7 @@ def _check_columns(
 
 
 def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
-    """Check codes for impossible values; the decoder clips those that are only too large."""
+    """Check codes for values that the decoder does not clip."""
     if codes.size == 0:
         return
     low, high = int(codes.min()), int(codes.max())
@@ -216,8 +214,7 @@ def _check_codes(name: str, codes: Codes, info: Surfels) -> None:
 
 
 def _parts(data: memoryview, columns: Sequence[ColumnEntry]) -> Iterator[memoryview]:
-    at = 0
     for column in columns:
         size = sum(column.bytes)
-        yield data[at : at + size]
-        at += size
+        yield data[:size]
+        data = data[size:]

@@ -1,7 +1,5 @@
-"""KTX2 files: 2D array textures with one level, in the texel formats of an atlas.
-
-Written from the Khronos KTX File Format Specification 2.0 and the Khronos Data Format Specification 1.3.
-"""
+"""KTX2 files: 2D array textures with one level, in the texel formats of an atlas, by the Khronos KTX File Format
+Specification 2.0 and Data Format Specification 1.3."""
 
 import struct
 from collections.abc import Mapping, Sequence
@@ -79,8 +77,8 @@ def descriptor(format: Format) -> bytes:
 def write_ktx2(
     path: str | Path, payload: Sequence[bytes], format: Format, width: int, height: int, writer: str
 ) -> None:
-    """Write a 2D array texture with one level, without supercompression. `payload`: a layer each, rows from the top.
-    `width`, `height`: in texels; multiples of 4 for bc7. `writer`: name and version of the program (KTXwriter)."""
+    """Write a 2D array texture, without supercompression. `payload`: a layer each, rows from the top. `width`,
+    `height`: in texels; multiples of 4 for bc7. `writer`: name and version of the program (KTXwriter)."""
     layout = _LAYOUTS[format]
     expected = layer_bytes(format, width, height)
     if not payload or any(len(layer) != expected for layer in payload):
@@ -105,8 +103,8 @@ def write_ktx2(
 
 
 def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
-    """Parse the header in the first `HEADER_LIMIT` bytes of a file, or more. `size`: bytes of the whole file. Raises
-    Ktx2Error: another kind of file, another size than the header states, or contradictory fields."""
+    """Parse the header from at least the first `HEADER_LIMIT` bytes of a file of `size` bytes. Raises Ktx2Error:
+    another kind of file, another size than the header states, or contradictory fields."""
     view = memoryview(data)
     if len(view) < _HEADER.size or bytes(view[:12]) != IDENTIFIER:
         raise Ktx2Error("not a KTX2 file")
@@ -116,7 +114,7 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
     data_at, data_size, raw_size = fields[15:]
     format: Format | None = next((name for name, layout in _LAYOUTS.items() if layout.vk_format == vk_format), None)
     if format is None:
-        raise Ktx2Error(f"the texel format {vk_format} is none of {[each.vk_format for each in _LAYOUTS.values()]}")
+        raise Ktx2Error(f"the texel format {vk_format} is none of {[kind.vk_format for kind in _LAYOUTS.values()]}")
     layout = _LAYOUTS[format]
     if scheme != 0 or sgd_at or sgd_size:
         raise Ktx2Error("the file is supercompressed; write it again without supercompression")
@@ -138,8 +136,7 @@ def read_header(data: bytes | bytearray | memoryview, size: int) -> Ktx2Image:
 
 
 def parse_ktx2(data: bytes | bytearray | memoryview) -> Ktx2Image:
-    """Parse a file written by `write_ktx2`, without copying the texels. Raises Ktx2Error: as `read_header`, or
-    truncated."""
+    """Parse a file of `write_ktx2`, without copying the texels. Raises Ktx2Error: as `read_header`."""
     view = memoryview(data)
     header = read_header(view, len(view))
     size = layer_bytes(header.format, header.width, header.height)

@@ -40,7 +40,7 @@ class BundleError(ValueError):
 
 
 def check_file_name(name: str, source: str) -> None:
-    """Raise BundleError of `source` unless a name is a plain file name, so that no bundle reaches out of its folder."""
+    """Raise BundleError of `source` unless a name is a plain file name: no bundle reaches out of its folder."""
     if not _is_file_name(name):
         raise BundleError(f"{source}: {short(name)} cannot be the name of a file of the bundle")
 
@@ -50,12 +50,12 @@ def _is_file_name(name: str) -> bool:
 
 
 def _only(value: float) -> AfterValidator:
-    """Build the check of a renderer constant, which is written for other programs; reading refuses any other value."""
+    """Build the check of a renderer's constant, which is stated for other programs."""
 
-    def check(found: float) -> float:
-        if found != value:
+    def check(stated: float) -> float:
+        if stated != value:
             raise PydanticCustomError("constant", "must be {value}, which is what is drawn with", {"value": value})
-        return found
+        return stated
 
     return AfterValidator(check)
 
@@ -130,7 +130,7 @@ class Surfels(Part):
 
 
 class AtlasEntry(Part):
-    """Contents of atlas.ktx2: residual = offset + scale * value, value = stored / 255 for bc7 and uint8; or of
+    """Contents of atlas.ktx2, residual = offset + scale * value with value = stored / 255 for bc7 and uint8; or of
     texels.bin (format dct), whose texels are rounded to 8 bits of that range."""
 
     file: Literal["atlas.ktx2", "texels.bin"] = ATLAS
@@ -139,7 +139,7 @@ class AtlasEntry(Part):
     step: Annotated[float, Field(ge=1e-6, le=100)] | None = None  # of coefficients at grade 0 (`texel_codes.GRADES`)
     page_width: Side | None = None
     page_rows: Side | None = None
-    """Arguments of `codec.packing.pack`, which gives the packing from the tile sizes."""
+    """Arguments of `codec.packing.pack`, which lays out the tiles."""
     columns: Annotated[list[ColumnEntry], Field(max_length=64)] | None = None  # of texels.bin, in order
     width: Side
     height: Side
@@ -151,8 +151,7 @@ class AtlasEntry(Part):
     scale: Annotated[float, Field(gt=0, le=2 * RESIDUAL_LIMIT)]
     range: str | None = None
     alpha_scale: Annotated[float, Field(gt=0, le=2)] | None = None
-    """Scale of the fourth channel: alpha = alpha_scale * value multiplies the surfel's opacity; a surfel without a tile
-    has the alpha of its column. None: opaque texels."""
+    """Scale of the fourth channel: alpha = alpha_scale * value multiplies the surfel's opacity. None: opaque texels."""
     clipped_fraction: Share | None = None
     encoder: str | None = None
     psnr: Decibels = None
@@ -257,8 +256,8 @@ class Manifest(Part):
 
 
 def describe(info: Mapping[str, Any]) -> Manifest:
-    """Build the manifest of `info`; arrays become lists, non-finite numbers null. Raises BundleError: a required value
-    is missing, or one is out of range."""
+    """Build the manifest of `info`; arrays become lists, non-finite numbers null. Raises BundleError: a value is
+    missing or out of range."""
     try:
         return Manifest.model_validate_json(strict_json.canonical(strict_json.plain(info)))
     except ValidationError as error:
@@ -266,8 +265,7 @@ def describe(info: Mapping[str, Any]) -> Manifest:
 
 
 def dump(manifest: Manifest) -> bytes:
-    """Serialise a manifest to bundle.json, with the digest of its contents. Raises BundleError: `parse` would refuse a
-    value."""
+    """Serialise a manifest to bundle.json, with its digest. Raises BundleError: `parse` would refuse a value."""
     info = describe(manifest.model_dump(mode="json", exclude={"digest"})).model_dump(mode="json")
     info["digest"] = strict_json.digest(info)
     return (json.dumps(info, indent=2, ensure_ascii=False) + "\n").encode()
@@ -275,8 +273,7 @@ def dump(manifest: Manifest) -> bytes:
 
 def parse(data: bytes, source: str = MANIFEST) -> Manifest:
     """Parse bundle.json and check everything that readers rely on; unknown keys are kept and ignored. Raises
-    BundleError: not a bundle, too new, a value missing or out of range, or a digest that does not match the
-    contents."""
+    BundleError: not a bundle, too new, a value missing or out of range, or the digest of other contents."""
     try:
         info = strict_json.loads(data)
         if not isinstance(info, dict) or info.get("format") != FORMAT:
@@ -284,7 +281,7 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
         stated = info.pop("digest", None)
         _check_version(info, source)
         text = strict_json.canonical(info)
-        found = strict_json.digest(info)
+        digest = strict_json.digest(info)
     except BundleError:
         raise
     except ValueError as error:
@@ -294,9 +291,9 @@ def parse(data: bytes, source: str = MANIFEST) -> Manifest:
     except ValidationError as error:
         raise BundleError(f"{source}: {describe_problems(error)}") from error
     if stated is None:
-        raise BundleError(f"{source}: digest is missing{_ON_PURPOSE.format(found)}")
-    if stated != found:
-        raise BundleError(f"{source} is altered: its digest is not that of its contents{_ON_PURPOSE.format(found)}")
+        raise BundleError(f"{source}: digest is missing{_ON_PURPOSE.format(digest)}")
+    if stated != digest:
+        raise BundleError(f"{source} is altered: its digest is not that of its contents{_ON_PURPOSE.format(digest)}")
     manifest.digest = stated
     return manifest
 
@@ -306,15 +303,12 @@ _ON_PURPOSE = '; if you have edited it on purpose, set "digest" to "{}"'
 
 def _check_version(info: Mapping[str, Any], source: str) -> None:
     version, surfels = info.get("version"), info.get("surfels")
-    found = re.fullmatch(r"([0-9]{1,6})\.[0-9]{1,6}", version) if isinstance(version, str) else None
-    if found is None:
+    match = re.fullmatch(r"([0-9]{1,6})\.[0-9]{1,6}", version) if isinstance(version, str) else None
+    if match is None:
         raise BundleError(f"{source}: version must look like {VERSION}, not {short(version)}")
-    newest = VERSION.split(".")[0]
-    if int(found[1]) > int(newest):
-        limit = f"this program reads up to {newest}.x: update bitymi-ns to open it"
-        raise BundleError(f"{source} has version {version}, {limit}")
+    newest, stated = VERSION.split(".")[0], f"{source} has version {version}"
+    if int(match[1]) > int(newest):
+        raise BundleError(f"{stated}, this program reads up to {newest}.x: update bitymi-ns to open it")
     file = surfels.get("file", SURFELS) if isinstance(surfels, dict) else None
-    if found[1] != newest and EARLIER.get(found[0]) != file:
-        raise BundleError(
-            f"{source} has version {version} with {short(file)}, which is read no longer: export it again"
-        )
+    if match[1] != newest and EARLIER.get(match[0]) != file:
+        raise BundleError(f"{stated} with {short(file)}, which is read no longer: export it again")

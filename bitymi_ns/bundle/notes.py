@@ -1,5 +1,4 @@
-"""Saved views, notes, measures and crop of a bundle: notes.json, not listed in bundle.json because viewers write it
-later."""
+"""Saved views, notes, measures and crop of a bundle: notes.json, not listed in bundle.json because viewers write it."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -18,12 +17,12 @@ NEWEST = 2  # version; the page writes 1 where nothing of version 2 is used
 SINCE_2 = ("measures", "unit", "crop", "hidden")
 MOST_VIEWS, MOST_NOTES, MOST_MEASURES, MOST_HIDDEN = 200, 500, 500, 200
 LONGEST_NAME, LONGEST_TEXT, LONGEST_UNIT = 80, 1000, 12
-"""Largest number of characters in the name of a view (and of a measure), in a note, and in the name of a unit."""
+"""Most characters in the name of a view or measure, in a note, and in the name of a unit."""
 FARTHEST = 1e9
 
 
 class NotesError(BundleError):
-    """A notes.json that is refused, or a crop that cannot be applied; the rest of the bundle is as it should be."""
+    """A notes.json that is refused, or a crop that cannot be applied; the rest of the bundle can be read."""
 
 
 def _printable(text: str) -> str:
@@ -149,7 +148,7 @@ def parse_notes(data: bytes, source: str = NOTES) -> Notes:
         stated = given.get("version") if isinstance(given, dict) else None
         if isinstance(stated, int) and stated > NEWEST:
             raise NotesError(f"{source}: version {stated} is newer than {NEWEST}: update bitymi-ns to read it")
-        found = Notes.model_validate(given)
+        notes = Notes.model_validate(given)
     except NotesError:
         raise
     except ValidationError as error:
@@ -157,18 +156,18 @@ def parse_notes(data: bytes, source: str = NOTES) -> Notes:
         raise _refusal(source, f"{where or 'the whole'}: {what}") from error
     except ValueError as error:
         raise _refusal(source, f"it is no JSON in UTF-8 ({error})") from error
-    for name in SINCE_2 if found.version == 1 else ():
-        if name in found.model_fields_set:
+    for name in SINCE_2 if notes.version == 1 else ():
+        if name in notes.model_fields_set:
             raise _refusal(source, f"{name}: version 1 has no such entry")
     names: set[str] = set()
-    for k, view in enumerate(found.views):
+    for k, view in enumerate(notes.views):
         axes = np.array([view.right, view.forward])
         if np.abs(axes @ axes.T - np.eye(2)).max() > UNIT_LENGTH:
             raise _refusal(source, f"views.{k}: right and forward must be unit vectors at right angles")
         if view.name in names:
             raise _refusal(source, f"views.{k}.name: an earlier view has this name")
         names.add(view.name)
-    return found
+    return notes
 
 
 def _refusal(source: str, what: str) -> NotesError:
@@ -176,16 +175,15 @@ def _refusal(source: str, what: str) -> NotesError:
 
 
 def read_notes(parts: Parts) -> tuple[bytes, Notes] | None:
-    """Read and check a bundle's notes.json: bytes and contents; None if it has none. Raises BundleError: it is
-    refused."""
+    """Read and check a bundle's notes.json: bytes and contents; None if there is none. Raises BundleError."""
     data = notes_data(parts)
     return None if data is None else (data, parse_notes(data, str(parts.bundle / NOTES)))
 
 
 def crop_of(parts: Parts) -> Crop | None:
     """Read the crop in a bundle's notes.json; None if it hides nothing. Raises as `read_notes`."""
-    found = read_notes(parts)
-    crop = Crop() if found is None else found[1].cropping
+    notes = read_notes(parts)
+    crop = Crop() if notes is None else notes[1].cropping
     return None if crop == Crop() else crop
 
 
@@ -196,7 +194,7 @@ def hides(bundle: str | Path) -> bool:
 
 
 def notes_of(bundle: str | Path) -> bytes | None:
-    """Read a bundle's notes.json for copying, but no link out of the folder. Raises BundleError: as `read_notes`."""
+    """Read a bundle's notes.json for copying, but no link out of the folder. Raises as `read_notes`."""
     with parts_of(bundle, inside=True) as parts:
-        found = read_notes(parts)
-    return None if found is None else found[0]
+        notes = read_notes(parts)
+    return None if notes is None else notes[0]

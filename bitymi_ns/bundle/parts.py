@@ -33,7 +33,7 @@ CONFIG = "config.yml"  # configuration for nerfstudio's tools, not covered by th
 CAMERAS, PREVIEWS = "cameras.json", ("preview.jpg", "preview.png")
 _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-# Records of a ZIP: a part's header, its row of the directory; ZIP64 end of directory, its locator, end of directory.
+# Records of a ZIP: a part's header, a row of the directory; ZIP64 end of directory, its locator, end of directory.
 _LOCAL, _CENTRAL = struct.Struct("<4s22xHH"), struct.Struct("<4s6xH8xLLHHH8xL")
 _LARGE, _LARGE_AT, _END = struct.Struct("<4s36xQQ"), struct.Struct("<4s4xQ4x"), struct.Struct("<4s8xLLH")
 _WIDE = 0xFFFFFFFF  # a number that stands in the row's ZIP64 field
@@ -45,7 +45,7 @@ class MissingPart(BundleError):
 
 
 def is_known(name: str) -> bool:
-    """Return True for file names of the format; a bundle may hold other files, which are not copied with it."""
+    """Return True for file names of the format; other files of a bundle are not copied with it."""
     known = (MANIFEST, SURFELS, ATLAS, COMPACT_SURFELS, TEXELS, POSTER, CAMERAS, *PREVIEWS)
     return name in known or _PHOTOGRAPH.fullmatch(name) is not None
 
@@ -63,8 +63,7 @@ def public_manifest(info: Manifest, data: bytes) -> bytes:
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a file of a bundle as `safe_reading.open_regular` does. Raises BundleError: missing, or it cannot be
-    read."""
+    """Open a file of a bundle as `safe_reading.open_regular` does. Raises BundleError: missing or unreadable."""
     try:
         return safe_reading.open_regular(path)
     except (FileNotFoundError, NotADirectoryError) as error:
@@ -85,15 +84,14 @@ class Parts:
     """Files of a bundle by name."""
 
     def __init__(self, bundle: Path, file: BufferedReader | None = None, inside: bool = False) -> None:
-        """Prefer `parts_of`. `bundle`: folder or file, also for messages. `file`: the opened single file; None for a
-        folder. `inside`: refuse links out of the folder."""
+        """Prefer `parts_of`. `bundle`: folder or file. `file`: the opened single file; None for a folder."""
         self.bundle, self._file, self._inside = bundle, file, inside
         self._entries, self._end = ({}, 0) if file is None else _read_directory(file)
 
     @contextmanager
     def opened(self, name: str) -> Iterator[tuple[BufferedReader, int]]:
-        """Open a file; yield it, at its beginning, and its size in bytes, at most so many of which may be read. Raises
-        BundleError: missing or unreadable."""
+        """Open a file; yield it, at its beginning, and its size in bytes: no more may be read. Raises BundleError:
+        missing or unreadable."""
         path = self.bundle / name
         try:
             if self._file is not None:
@@ -107,7 +105,7 @@ class Parts:
             raise BundleError(f"{path} cannot be read: {error.strerror}") from error
 
     def _seek(self, file: BufferedReader, name: str) -> int:
-        """Move to the beginning of a part of the single file, and return its size."""
+        """Move to the beginning of a part of the single file; return its size."""
         if name not in self._entries:
             raise MissingPart(f"{self.bundle} has no {name}")
         begin, size, stored = self._entries[name]
@@ -131,8 +129,8 @@ class Parts:
 
 @contextmanager
 def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
-    """Open the files of a bundle, a folder or single file. `inside`: refuse links out of the folder, because its
-    contents are copied on. Raises BundleError: the single file is damaged."""
+    """Open the files of a bundle, a folder or single file. `inside`: refuse links out of the folder, for copying.
+    Raises BundleError: the single file is damaged."""
     path = Path(bundle)
     if not os.path.isfile(path):
         yield Parts(path, inside=inside)
@@ -149,9 +147,9 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
 
 
 def _read_directory(file: BufferedReader) -> tuple[dict[str, _Entry], int]:
-    """Read the directory of a single file as web/src/bundle/archive.ts does: by name where the parts are said to be;
-    and where it begins. Hashes in bundle.json decide whether the parts are whole. Raises ValueError: there is none, or
-    the file does not begin with the first part, and could be of another type, too."""
+    """Read the directory of a single file as web/src/bundle/archive.ts does: where parts of each name are said to be,
+    and where the directory begins. Hashes in bundle.json decide whether parts are whole. Raises ValueError: there is
+    none, or the file does not begin with the first part and could be of another type, too."""
     size = file.seek(0, os.SEEK_END)
     records = _LARGE.size + _LARGE_AT.size + _END.size
     file.seek(max(0, size - records))
@@ -225,8 +223,8 @@ def _is_archive(path: Path) -> bool:
 
 
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
-    """Check that a bundle may be written to a folder. Raises BundleError: it exists and `overwrite` is off; or it is
-    not a bundle, or holds foreign files, or a notes.json that cannot be carried over."""
+    """Check that a bundle may be written to a folder. Raises BundleError: the folder exists and `overwrite` is off, is
+    not a bundle, or holds foreign files or a notes.json that cannot be carried over."""
     folder = Path(folder)
     made = _replaced(folder) if (folder / MANIFEST).is_file() else None
     check_replaceable(folder, f"a bundle (it has no {MANIFEST})", made, overwrite, BundleError, "--overwrite True")
@@ -251,14 +249,13 @@ def _replaced(folder: Path) -> Iterator[str]:
 
 
 def files_of(folder: Path) -> list[str]:
-    """List the files of a bundle of any version: bundle.json, the files it lists, config.yml, and cameras.json, which
-    the first versions of `bake_scene` did not list. Raises BundleError: bundle.json is unreadable."""
+    """List the files of a bundle of any version, with config.yml, and cameras.json, which the first versions of
+    `bake_scene` did not list in bundle.json. Raises BundleError: bundle.json is unreadable."""
     try:
         with parts_of(folder) as parts:
             listed = json_of(bytes(parts.read(MANIFEST, MANIFEST_LIMIT)))["files"]
         return [MANIFEST, CONFIG, CAMERAS, *map(str, listed)]
     except (OSError, ValueError, LookupError, TypeError) as error:
-        raise BundleError(
-            f"{folder / MANIFEST} cannot be read ({error}): which files of {folder} are the bundle is not known. "
-            "Remove it yourself, or choose another folder"
-        ) from error
+        unknown = f"which files of {folder} are the bundle is not known"
+        remedy = "Remove it yourself, or choose another folder"
+        raise BundleError(f"{folder / MANIFEST} cannot be read ({error}): {unknown}. {remedy}") from error

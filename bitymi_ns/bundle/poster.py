@@ -22,7 +22,7 @@ _SMALLEST = 16
 
 
 def draw_poster(scene: BakedScene, camera: Camera, background: Sequence[float]) -> Pixels:
-    """Render the scene on the CPU from a camera, reduced to at most `SIDE` pixels along a side: [H, W, 3]."""
+    """Render the scene, on the CPU, with at most `SIDE` pixels along a side: [H, W, 3]."""
     view = camera.to("cpu").within(SIDE)
     return as_bytes(scene.render(view, torch.tensor(background, dtype=torch.float32)).rgb).numpy()
 
@@ -33,8 +33,8 @@ def most_bytes(scene: int) -> int:
 
 
 def encode_poster(pixels: Pixels, most: int) -> bytes | None:
-    """Encode a picture [H, W, 3] as lossy WebP of at most `most` bytes: best quality that fits, else fewer pixels. None
-    if nothing fits or this Pillow cannot write WebP: posters are optional."""
+    """Encode a picture [H, W, 3] as lossy WebP of at most `most` bytes: the best quality that fits, else fewer pixels.
+    None, as posters are optional: nothing fits, or this Pillow cannot write WebP."""
     if not features.check("webp"):
         return None
     image = Image.fromarray(pixels)

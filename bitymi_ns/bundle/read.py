@@ -31,6 +31,7 @@ from .manifest import (
     MANIFEST,
     SURFELS,
     TEXELS,
+    AtlasEntry,
     BundleError,
     Manifest,
     parse,
@@ -44,10 +45,10 @@ from .surfel_table import TERMS, from_columns
 REMEDY = "Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas."
 """Advice on a damaged bundle."""
 BESIDE_LIMIT = 64 << 20
-"""Largest file other than surfels and texels, such as a photograph, that is kept in memory, bytes."""
+"""Largest file other than surfels and texels that is kept in memory, bytes."""
 LARGE_ATLAS = 64 << 20
 """Least size in bytes of a decoded compact atlas that is encoded to BC7 for a CUDA device, a quarter of the memory.
-Smaller atlases fit any device, and encoding costs time and some quality of texels that were not tuned for BC7."""
+Smaller ones fit any device, and encoding costs time and some quality."""
 LOAD_PROFILE: Profile = "veryfast"  # for `LARGE_ATLAS`; the next faster profile loses more than twice as many dB
 CONTENTS = SCENE_FILES | {CAMERAS}  # files used by `assemble`
 _CHUNK = 1 << 22
@@ -67,7 +68,7 @@ class Bundle:
 
     @property
     def hidden(self) -> str:
-        """Statement of the surfels that were left out by a crop; empty if there are none."""
+        """Statement of the surfels that a crop left out; empty if none."""
         count = self.info.surfels.count
         return f"{count - len(self):,} of {count:,} surfels are hidden by {NOTES}" if len(self) < count else ""
 
@@ -75,7 +76,7 @@ class Bundle:
         return replace(self, scene=self.scene.to(device))
 
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Render a view as `BakedScene.render`, over a background [3]; None: the bundle's own."""
+        """Render a view as `BakedScene.render`; `background`: None: the bundle's own."""
         if background is None:
             background = torch.tensor(self.info.render.background, device=self.scene.tiles.device, dtype=torch.float32)
         return self.scene.render(camera, background, maps)
@@ -85,14 +86,14 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, cr
     """Load a bundle.
 
     Args:
-        folder: the bundle's folder, or its single file (`single.write_single`).
+        folder: the bundle's folder, or its single file.
         verify: compare every file with its SHA-256 (sizes are always compared).
         decode: decode a BC7 atlas to four bytes per texel; a CUDA device draws from the blocks alone. False also
-            encodes large compact atlases (`LARGE_ATLAS`) to BC7, because they have no blocks.
+            encodes compact atlases of at least `LARGE_ATLAS` to BC7.
         crop: leave out the surfels that notes.json hides.
 
     Raises BundleError: a file of the scene is missing, truncated, altered or malformed, a value is out of range, the
-    version is too new, or memory is insufficient. Other files are left out then, with a warning. Raises NotesError:
+    version is too new, or memory is insufficient; other such files are left out, with a warning. Raises NotesError:
     `crop`, and notes.json is refused or hides no surfels, or all."""
     with parts_of(folder) as parts:
         info = manifest_of(parts)
@@ -110,18 +111,17 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, cr
 
 
 def _cropped(bundle: Bundle, parts: Parts) -> Bundle:
-    found, path = crop_of(parts), parts.bundle / NOTES
-    if found is None:
+    crop, path = crop_of(parts), parts.bundle / NOTES
+    if crop is None:
         raise NotesError(f"{path} hides no surfels: save a crop there with `bitymi view`, or do not ask for it")
-    kept = found.keeps(bundle.scene.surfels["means"])
+    kept = crop.keeps(bundle.scene.surfels["means"])
     if not kept.any():
         raise NotesError(f"{path} hides all surfels: correct its crop with `bitymi view`, or do not ask for it")
     return replace(bundle, scene=bundle.scene.only(kept))
 
 
 def read_manifest(folder: str | Path) -> Manifest:
-    """Read bundle.json of a folder or single file. Raises BundleError: missing, malformed or altered, or out of
-    range."""
+    """Read bundle.json of a folder or single file. Raises BundleError: missing, or as `manifest.parse`."""
     with parts_of(folder) as parts:
         return manifest_of(parts)
 
@@ -150,10 +150,9 @@ def download_bytes(folder: Path, info: Manifest) -> int:
 
 
 def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep: bool = True) -> bytearray:
-    """Read a file listed in bundle.json. `verify`: compare it with its SHA-256 while reading. `keep`: False: only check
-    it and return no bytes. Raises BundleError: the file is missing, its size or hash differs, its header contradicts
-    its size or bundle.json, or its contents exceed this machine's memory. All but the hash is checked before the file
-    is read."""
+    """Read a file listed in bundle.json. `verify`: compare it with its SHA-256. `keep`: False: only check it and return
+    no bytes. Raises BundleError: the file is missing, its size or hash differs, its header contradicts its size or
+    bundle.json, or its contents exceed this machine's memory; all but the hash is checked before reading."""
     path, entry = parts.bundle / name, info.files[name]
     with parts.opened(name) as (file, size):
         if size != entry.bytes:
@@ -178,7 +177,7 @@ def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep
 def _read_whole(
     file: BufferedReader, head: bytes, size: int, keep: bool, path: Path, take: Callable[[Any], object]
 ) -> bytearray:
-    """Read a file of `size` bytes, of which `head` is read already; `take` gets all of them. Return them if `keep`."""
+    """Read a file of `size` bytes, of which `head` is read already; `take` gets all of them."""
     data, at = bytearray(size if keep else min(size, max(_CHUNK, len(head)))), len(head)
     view = memoryview(data)
     view[:at] = head
@@ -194,8 +193,7 @@ def _read_whole(
 
 
 def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: bool = True) -> Bundle:
-    """Assemble a bundle from the results of `read_file`, by name. Raises BundleError: malformed, or a value is out of
-    range."""
+    """Assemble a bundle from files by name. Raises BundleError: malformed, or a value is out of range."""
     render, atlas, points = info.render, info.atlas, info.render.photographed
     contents = _compact_contents if info.surfels.file == COMPACT_SURFELS else _ply_contents
     scene = BakedScene(
@@ -213,23 +211,23 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
 
 def _ply_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], decode: bool) -> dict[str, Any]:
     """Decode surfels.ply and atlas.ktx2 to fields of `BakedScene`."""
-    path = folder / SURFELS
+    path, atlas = folder / SURFELS, info.atlas
     try:
         elements = ply.parse_ply(files[SURFELS])
-        extent = info.atlas.extent if info.atlas else SUPPORT
+        extent = SUPPORT if atlas is None else atlas.extent
         kind, terms = info.surfels.view_color, elements.get(TERMS)
-        found = from_columns(elements["vertex"], kind, terms, extent, info.has_alpha)
+        fields = from_columns(elements["vertex"], kind, terms, extent, info.has_alpha)
     except ply.PlyError as error:
         raise BundleError(f"{path}: {error}") from error
-    _check_tiles(found["tiles"], info, path)
-    if info.atlas is None:
-        return found
+    _check_tiles(fields["tiles"], atlas, path)
+    if atlas is None:
+        return fields
     try:
         image = ktx2.parse_ktx2(files[ATLAS])
     except ktx2.Ktx2Error as error:
         raise BundleError(f"{folder / ATLAS}: {error}") from error
     texels, blocks = _texels(image, decode, info.has_alpha, folder / ATLAS)
-    return {**found, "atlas": texels, "blocks": blocks}
+    return {**fields, "atlas": texels, "blocks": blocks}
 
 
 def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearray], decode: bool) -> dict[str, Any]:
@@ -243,8 +241,8 @@ def _compact_contents(folder: Path, info: Manifest, files: Mapping[str, bytearra
         if atlas is not None:
             packing = compact.packing_of(atlas, sizes)
             tiles, where = torch.from_numpy(packing.tiles), folder / TEXELS
-            found = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]), alpha)
-            texels = byte_pages(found.decoded(), packing, Range(atlas.offset, atlas.scale, ""))
+            coded = compact.decode_texels(atlas, sizes, residual, step, memoryview(files[TEXELS]), alpha)
+            texels = byte_pages(coded.decoded(), packing, Range(atlas.offset, atlas.scale, ""))
             if not decode and texels.numel() >= LARGE_ATLAS:
                 blocks = _encode_blocks(texels, info.has_alpha)
                 texels = texels if blocks is None else None
@@ -270,16 +268,14 @@ def _encode_blocks(texels: Tensor, alpha: bool) -> Tensor | None:
     except RuntimeError as error:
         if not isinstance(error.__cause__, ImportError):
             raise
-        warnings.warn(
-            f"the texels stay decoded, {texels.numel() / 1e6:.0f} MB on the GPU where BC7 takes a quarter: the "
-            "encoder is not installed (pip install ispc_texcomp)",
-            stacklevel=2,
-        )
+        size = f"{texels.numel() / 1e6:.0f} MB on the GPU where BC7 takes a quarter"
+        remedy = "the encoder is not installed (pip install ispc_texcomp)"
+        warnings.warn(f"the texels stay decoded, {size}: {remedy}", stacklevel=2)
         return None
 
 
-def _check_tiles(tiles: Tensor, info: Manifest, source: Path) -> None:
-    layers, height, width = (info.atlas.layers, info.atlas.height, info.atlas.width) if info.atlas else (1, 0, 0)
+def _check_tiles(tiles: Tensor, atlas: AtlasEntry | None, source: Path) -> None:
+    layers, height, width = (1, 0, 0) if atlas is None else (atlas.layers, atlas.height, atlas.width)
     x, y, layer, r_u, r_v = tiles.long().unbind(1)
     good = (tiles >= 0).all(1) & (x + r_u <= width) & (y + r_v <= height) & (layer < layers)
     good &= (r_u > 0) == (r_v > 0)

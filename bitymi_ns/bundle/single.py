@@ -1,5 +1,4 @@
-"""Bundle in one file: an uncompressed ZIP with its parts in the order a viewer needs them; conversion to and from a
-folder."""
+"""Bundle in one file: an uncompressed ZIP with its parts in the order a viewer needs them."""
 
 import io
 import os
@@ -31,11 +30,11 @@ class SingleFile:
 
 
 def write_single(bundle: str | Path, path: str | Path) -> SingleFile:
-    """Write a bundle to one file, atomically: the files of the format that bundle.json lists, and notes.json.
+    """Write a bundle, a folder or such a file, to one file, atomically: the files of the format that bundle.json lists,
+    and notes.json.
 
     Nothing is deflated, sizes precede the parts, and bundle.json comes first: the beginning of the file tells where
-    everything lies, and each part is one byte range. `bundle`: folder, or such a file. Raises BundleError: no bundle, a
-    file is missing or altered, or memory is insufficient."""
+    each part lies. Raises BundleError: no bundle, a file is missing or altered, or memory is insufficient."""
     data, written = joined(bundle)
     with complete_file(Path(path), follow=True) as file:
         file.write(data)
@@ -48,7 +47,7 @@ def write_single(bundle: str | Path, path: str | Path) -> SingleFile:
 
 
 def is_single(path: Path) -> bool:
-    """Return True if a file is a bundle and may be replaced by one. Raises BundleError: the system cannot read it."""
+    """Return True if a file is a bundle. Raises BundleError: the system cannot read it."""
     try:
         read_manifest(path)
     except BundleError as error:
@@ -59,13 +58,13 @@ def is_single(path: Path) -> bool:
 
 
 def joined(bundle: str | Path) -> tuple[bytes, SingleFile]:
-    """Build the contents of `write_single`'s file; returns and raises as it does."""
+    """Build the contents of `write_single`'s file; raises as it does."""
     first, buffer = 0, io.BytesIO()
     with parts_of(bundle, inside=True) as parts:
         info = manifest_of(parts)
         needed, there = 2 * sum(info.files[name].bytes for name in _names(info)), machine_memory()
         if needed > there:
-            why = f"one file of it takes {size_text(needed)} of memory to make, this machine has {size_text(there)}"
+            why = f"that takes {size_text(needed)} of memory, this machine has {size_text(there)}"
             raise BundleError(f"{parts.bundle} cannot be packed: {why}")
         with enough_memory(parts.bundle, info), zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
             for name, data in _contents(parts, info):
@@ -79,9 +78,8 @@ def joined(bundle: str | Path) -> tuple[bytes, SingleFile]:
 
 def write_folder(bundle: str | Path, folder: Path, beside: Mapping[str, bytes]) -> list[str]:
     """Write the files of a bundle, a folder or single file, to a missing or empty folder, atomically. `beside`: further
-    files by name, not covered by bundle.json. Returns the files listed in bundle.json that are not of the format and
-    were not written. Raises BundleError: no bundle, a file is missing or altered, memory is insufficient, or the folder
-    is occupied. Raises OSError: it cannot be written."""
+    files by name, not covered by bundle.json. Returns `SingleFile.left_out`. Raises BundleError: as `write_single`, or
+    the folder is occupied. Raises OSError: it cannot be written."""
 
     def check() -> None:
         if os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir())):
@@ -102,7 +100,7 @@ def _names(info: Manifest) -> list[str]:
 
 
 def _contents(parts: Parts, info: Manifest) -> Iterator[tuple[str, bytes | bytearray]]:
-    """Yield name and bytes of each file to copy, bundle.json first, each compared with its hash."""
+    """Yield name and bytes of each file to copy, compared with its hash."""
     yield MANIFEST, public_manifest(info, parts.read(MANIFEST, MANIFEST_LIMIT))
     for name in _names(info):
         yield name, read_file(parts, info, name)

@@ -17,13 +17,13 @@ from .surfel_table import TERMS
 SCENE_FILES = frozenset((SURFELS, ATLAS, COMPACT_SURFELS, TEXELS))  # surfels and texels
 HEAD = max(ply.HEADER_LIMIT, ktx2.HEADER_LIMIT)  # leading bytes that `check_head` reads
 _SURFEL_BYTES, _TERM_BYTES, _TEXEL_BYTES = 340, 150, 60
-"""Lower bounds of the memory for decoding a compact bundle, in bytes; measured: 370 per surfel (2 million), 165 per
-term (4 million), 67 per texel with its pages (17 million)."""
+"""Lower bounds of the memory for decoding a compact bundle, bytes; measured: 370 per surfel (2 million), 165 per term
+(4 million), 67 per texel with its pages (17 million)."""
 
 
 def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
-    """Check the beginning of a file of surfels or texels against its size and bundle.json; other files pass. Raises
-    PlyError, Ktx2Error, StreamError: they differ."""
+    """Check the beginning of a file of surfels or texels against its size and bundle.json. Raises PlyError, Ktx2Error,
+    StreamError: they differ."""
     surfels, atlas = info.surfels, info.atlas
     if name == SURFELS:
         elements = ply.header_of(head, size).elements
@@ -34,9 +34,9 @@ def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
             raise ply.PlyError(f"it has {terms} view-colour terms, surfels.terms of {MANIFEST} says {surfels.terms}")
     elif name == ATLAS:
         header = ktx2.read_header(head, size)
-        found = (header.format, header.width, header.height, header.layers)
-        if atlas is None or found != (atlas.format, atlas.width, atlas.height, atlas.layers):
-            raise ktx2.Ktx2Error(f"format and size {found} are not those of {MANIFEST}")
+        kind = (header.format, header.width, header.height, header.layers)
+        if atlas is None or kind != (atlas.format, atlas.width, atlas.height, atlas.layers):
+            raise ktx2.Ktx2Error(f"format and size {kind} are not those of {MANIFEST}")
     elif name == COMPACT_SURFELS or (name == TEXELS and atlas is not None):
         compact.check_size(info, name, size)
 
@@ -54,8 +54,8 @@ def enough_memory(bundle: Path, info: Manifest) -> Iterator[None]:
 
 
 def check_memory(bundle: Path, info: Manifest, name: str) -> None:
-    """Check that a file of surfels or texels fits into this machine's memory, before reading it. Raises BundleError:
-    states the memory needed."""
+    """Check that a file of surfels or texels fits into this machine's memory. Raises BundleError: states the memory
+    needed."""
     least, there = least_memory(info, name), machine_memory()
     if least > there:
         needs = f"{bundle / name} needs more memory than there is: its contents take at least {size_text(least)}"
@@ -63,7 +63,7 @@ def check_memory(bundle: Path, info: Manifest, name: str) -> None:
 
 
 def least_memory(info: Manifest, name: str) -> int:
-    """Estimate the least memory for reading a file of surfels or texels, bytes: file, intermediate data, pages."""
+    """Estimate the least memory for reading a file of surfels or texels, bytes."""
     surfels, atlas, total = info.surfels, info.atlas, info.files[name].bytes
     if name == COMPACT_SURFELS:
         total += _SURFEL_BYTES * surfels.count + _TERM_BYTES * (surfels.terms or 0)
@@ -73,13 +73,13 @@ def least_memory(info: Manifest, name: str) -> int:
 
 
 def machine_memory() -> int:
-    """Return the memory of this machine, or this process's limit if that is lower, in bytes."""
+    """Return the memory of this machine, or this process's lower limit, in bytes."""
     return int(min(psutil.virtual_memory().total, memory_limit()))
 
 
 def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/proc/self/cgroup")) -> float:
-    """Return the memory limit of this process's control groups (v2 and v1), bytes; infinite if none has one."""
-    found = [math.inf]
+    """Return the memory limit of this process's control groups (v2 and v1), bytes; infinite without one."""
+    limits = [math.inf]
     with suppress(OSError):  # not Linux
         for line in cgroups.read_text().splitlines():
             _, controllers, path = line.split(":", 2)
@@ -87,9 +87,9 @@ def memory_limit(mount: Path = Path("/sys/fs/cgroup"), cgroups: Path = Path("/pr
                 continue
             base, name = (mount / "memory", "memory.limit_in_bytes") if controllers else (mount, "memory.max")
             folder = base / path.lstrip("/")
-            for each in (folder, *folder.parents):
+            for group in (folder, *folder.parents):
                 with suppress(OSError, ValueError):  # another namespace; "max"
-                    found.append(float((each / name).read_text()))
-                if each == base:
+                    limits.append(float((group / name).read_text()))
+                if group == base:
                     break
-    return min(found)
+    return min(limits)

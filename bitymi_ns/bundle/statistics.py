@@ -1,7 +1,4 @@
-"""Statistics of the bake in bundle.json: surfels left out, errors, sizes.
-
-Every part may lack fields that earlier versions did not write, and keeps unknown keys.
-"""
+"""Statistics of the bake in bundle.json: surfels left out, errors, sizes. Earlier versions lack some fields."""
 
 from __future__ import annotations
 
@@ -47,7 +44,7 @@ Decibels = Annotated[Annotated[float, Field(ge=-1e3, le=1e3)] | None, BeforeVali
 
 
 class Percentiles(Part):
-    """Percentiles of an error over the surfels; p100 is the largest. None: not finite, or too large to be stated."""
+    """Percentiles of an error over the surfels. None: not finite, or too large to be stated."""
 
     p50: NotNegative | None = None
     p90: NotNegative | None = None
@@ -58,13 +55,13 @@ class Percentiles(Part):
     def of(cls, values: Tensor) -> Percentiles:
         """Compute the percentiles of [n] values, n >= 1, to four digits."""
         ordered = values.double().sort().values
-        found = {p: round(float(ordered[round((len(ordered) - 1) * p / 100)]), 4) for p in (50, 90, 99, 100)}
-        return cls(**{f"p{p}": value if value <= _LARGEST else None for p, value in found.items()})
+        rounded = {p: round(float(ordered[round((len(ordered) - 1) * p / 100)]), 4) for p in (50, 90, 99, 100)}
+        return cls(**{f"p{p}": value if value <= _LARGEST else None for p, value in rounded.items()})
 
 
 class Certificate(Part):
     """Numbers of surfels whose stored residual is within the tolerance in the closest training view: error times
-    blending weight, averaged per pixel, root mean square over the tile; alphas are ignored."""
+    blending weight, averaged per pixel, root mean square over the tile; without alphas."""
 
     against: Literal["field", "texels"]  # reference: texels before quantisation; earlier: the field
     tolerance: NotNegative
@@ -83,7 +80,7 @@ class Certificate(Part):
 
 
 class LeftOut(Part):
-    """Numbers of surfels left out, by reason; `unseen` if visibility was computed."""
+    """Numbers of surfels left out, by reason."""
 
     not_finite: Whole | None = None
     beyond_limits: Whole | None = None
@@ -105,10 +102,10 @@ class KeptTexels(Part):
     nyquist: Count | None = None
     after_cap_by_views: Count | None = None
     within_visible_part: Count | None = None
-    polished: Count | None = None  # texels before the polish
-    learned: Count | None = None  # texels that were trained
+    polished: Count | None = None  # before the polish
+    learned: Count | None = None  # trained ones
     kept: Count | None = None
-    not_finite: Count | None = None  # texels where the field was not finite
+    not_finite: Count | None = None  # where the field was not finite
 
 
 class AtlasCost(Part):
@@ -152,8 +149,8 @@ class Rounding(Part):
     """Mean squared error in the training views before texels were tuned, colours in [0, 1]."""
     steps: dict[str, NotNegative] = {}  # by column, as in `surfel_codes.REFERENCE`
     alternatives: Annotated[list[tuple[NotNegative, Decibels]], Field(max_length=16)] | None = None
-    """Other precisions: bytes of surfels and texels relative to the chosen one, and PSNR difference over held-out
-    views, else the training views, dB, before texels were tuned."""
+    """Other precisions: bytes relative to the chosen one, and PSNR difference over held-out, else training views, dB,
+    before texels were tuned."""
 
 
 class FineTuning(Part):
@@ -174,7 +171,7 @@ class FineTuning(Part):
 
 class HeldOut(Part):
     """Mean PSNR over the held-out views, dB, of the bundle (`baked`), the trained scene (`neural`) and the photographs
-    against each other; `worst`: of the view where the bundle differs most from the trained scene."""
+    against each other; `worst`: of the view where bundle and trained scene differ most."""
 
     views: Whole | None = None
     psnr_baked_against_neural: Decibels = None

@@ -11,8 +11,8 @@ from torch import Tensor
 
 
 def loads(data: bytes | bytearray) -> Any:
-    """Parse UTF-8 JSON. Raises ValueError: not JSON, a duplicate key, NaN or infinity (also as 1e999), or nested too
-    deeply."""
+    """Parse UTF-8 JSON. Raises ValueError: not JSON, a duplicate key, a number that is not finite (also 1e999), or
+    nested too deeply."""
     try:
         return json.loads(
             data.decode("utf-8"), object_pairs_hook=_object, parse_constant=_constant, parse_float=_finite
@@ -38,9 +38,9 @@ def digest(value: Any) -> str:
 def plain(value: Any) -> Any:
     """Convert to JSON types: arrays to lists, non-finite numbers to None, anything unknown to text."""
     if isinstance(value, Mapping):
-        return {str(key): plain(each) for key, each in value.items()}
+        return {str(key): plain(entry) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(each) for each in value]
+        return [plain(entry) for entry in value]
     if isinstance(value, (Tensor, np.ndarray, np.generic)):
         return plain(value.tolist())
     if isinstance(value, float):
@@ -51,12 +51,12 @@ def plain(value: Any) -> Any:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    members: dict[str, Any] = {}
     for key, value in pairs:
-        if key in found:
+        if key in members:
             raise ValueError(f"the key {key[:60]!r} occurs twice")
-        found[key] = value
-    return found
+        members[key] = value
+    return members
 
 
 def _constant(text: str) -> float:

@@ -112,8 +112,8 @@ def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: fl
 
 
 def check_limits(surfels: Mapping[str, Tensor], kind: str, refuse: Callable[[str], Exception] = PlyError) -> None:
-    """Raise `refuse` of a line with column and row of surfels.ply if a number is beyond its limit (`limits.LIMITS`).
-    `surfels`: parameters by name, including mean_residual. `kind`: a name of `ops.VIEW_COLORS`."""
+    """Raise `refuse`, naming column and row, if a number is beyond its limit (`limits.LIMITS`). `surfels`: parameters
+    by name, also mean_residual. `kind`: a name of `ops.VIEW_COLORS`."""
     for name, values in surfels.items():
         bad = beyond(name, kind, values)
         if bad.any():
@@ -182,11 +182,13 @@ def from_columns(
 def _full_from_columns(columns: Mapping[str, npt.NDArray], kind: str, count: int) -> dict[str, Tensor]:
     entry, surfels = VIEW_COLORS[kind], {}
     for name, shape, width in ((p.name, p.shape, p.width) for p in entry.parameters):
-        found = [int(match[1]) for match in map(re.compile(rf"{name}_([0-9]{{1,5}})").fullmatch, columns) if match]
-        if sorted(found) != list(range(len(found))) or len(found) % width or (-1 not in shape and len(found) != width):
-            raise PlyError(f"the view colour needs {name}_0.. in groups of {width}, not {len(found)} columns")
-        values = _stack(columns, _numbered(name, len(found))) if found else torch.zeros(count, 0, dtype=torch.float32)
-        surfels[name] = values.reshape(count, *(len(found) // width if size < 0 else size for size in shape))
+        matches = map(re.compile(rf"{name}_([0-9]{{1,5}})").fullmatch, columns)
+        numbers = sorted(int(match[1]) for match in matches if match)
+        total = len(numbers)
+        if numbers != list(range(total)) or total % width or (-1 not in shape and total != width):
+            raise PlyError(f"the view colour needs {name}_0.. in groups of {width}, not {total} columns")
+        values = _stack(columns, _numbered(name, total)) if total else torch.zeros(count, 0, dtype=torch.float32)
+        surfels[name] = values.reshape(count, *(total // width if size < 0 else size for size in shape))
     if len({surfels[p.name].shape[1] for p in entry.parameters if -1 in p.shape}) != 1:
         raise PlyError(f"the parameters of {entry.title} disagree about the number of {entry.term}s")
     return surfels
@@ -217,7 +219,7 @@ def _plain(value: Tensor) -> Tensor:
 
 
 def _stack(columns: Mapping[str, npt.NDArray], names: tuple[str, ...], dtype: type = np.float32) -> Tensor:
-    """Stack columns to [N, len(names)]; raises a PlyError if one is missing or of another type."""
+    """Stack columns to [N, len(names)]. Raises PlyError: one is missing or of another type."""
     for name in names:
         if name not in columns:
             raise PlyError(f"the column {name} is missing")

@@ -26,8 +26,7 @@ class Check:
 
 
 def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
-    """Check a bundle on its own: sizes and hashes of its files, formats, numbers, tiles. Returns it, None if
-    unreadable."""
+    """Check a bundle: sizes and hashes of its files, formats, numbers, tiles. Returns it; None: unreadable."""
     try:
         with parts_of(folder) as parts:
             info = manifest_of(parts)
@@ -46,7 +45,7 @@ def check_files(folder: str | Path) -> tuple[Bundle | None, list[Check]]:
 
 
 def _check_contents(parts: Parts, info: Manifest, checks: list[Check]) -> Bundle | None:
-    """Add the checks of the files that bundle.json lists, and return what they hold; None if it cannot be read."""
+    """Add the checks of the files that bundle.json lists, and return what they hold; None: unreadable."""
     files: dict[str, bytearray] = {}
     try:
         with enough_memory(parts.bundle, info):
@@ -76,19 +75,19 @@ def _format_world(frame: WorldEntry) -> str:
 
 
 def check_world(stated: WorldEntry, world: World) -> Check:
-    """Compare the frame in bundle.json with that of the training run. `stated`: from bundle.json."""
+    """Compare the frame in bundle.json with that of the training run."""
     wrong = []
-    for key, found in world.described().items():
+    for key, of_run in world.described().items():
         value = getattr(stated, key)
         if value is None:
             continue
-        same = value == found if isinstance(found, str) else np.allclose(value, found, rtol=1e-4, atol=1e-5)
-        wrong += [] if same else [f"{key} is {value}, that of the run {found}"]
+        same = value == of_run if isinstance(of_run, str) else np.allclose(value, of_run, rtol=1e-4, atol=1e-5)
+        wrong += [] if same else [f"{key} is {value}, that of the run {of_run}"]
     return Check("frame of the scene", not wrong, "; ".join(wrong) or "as the run has it")
 
 
 def check_certificate(bundle: Bundle) -> list[Check]:
-    """Check that the certificate's numbers fit each other; no checks without one."""
+    """Check that the certificate's numbers, if there are any, fit each other."""
     stated = bundle.info.statistics.certificate
     if stated is None:
         return []
@@ -104,7 +103,7 @@ def steps_text(error: float | None) -> str:
 
 
 def _tiles(bundle: Bundle) -> Check:
-    """Check that sides are powers of two on the grid of 4 x 4 blocks and that tiles do not overlap."""
+    """Check that tiles are powers of two on the grid of 4 x 4 blocks and do not overlap."""
     tiled = bundle.scene.tiles[bundle.scene.tiles[:, 3] > 0].long()
     if len(tiled) == 0:
         return Check("tiles", True, "none")
@@ -112,9 +111,9 @@ def _tiles(bundle: Bundle) -> Check:
     if ((sides & (sides - 1)) != 0).any() or (tiled[:, [0, 1, 3, 4]] % 4 != 0).any():
         return Check("tiles", False, "a tile is not a power of two on the grid of 4 x 4 blocks")
     blocks = int((sides // 4).prod(1).sum())
-    owned = _count_tiles(tiled, bundle.scene.atlas)
-    if int((owned > 0).sum()) != blocks:
-        return Check("tiles", False, f"{blocks - int((owned > 0).sum()):,} blocks belong to more than one tile")
+    owned = int((_count_tiles(tiled, bundle.scene.atlas) > 0).sum())
+    if owned != blocks:
+        return Check("tiles", False, f"{blocks - owned:,} blocks belong to more than one tile")
     return Check("tiles", True, f"{len(tiled):,} of {len(bundle):,} surfels, {16 * blocks:,} texels, no two overlap")
 
 

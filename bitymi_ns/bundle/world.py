@@ -23,8 +23,7 @@ Row = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class WorldEntry(Part):
-    """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), and the scene's up vector and
-    metric scale if known."""
+    """Transform from the capture's frame, x_scene = scale * (transform @ [x_capture, 1]), up vector, metric scale."""
 
     transform: tuple[Row, Row, Row]
     scale: Positive
@@ -44,12 +43,12 @@ class WorldEntry(Part):
 
 def same_frame(a: WorldEntry, b: WorldEntry) -> bool:
     """Test if two scenes have the same frame, to a thousandth of their unit."""
-    return np.allclose(*(each.scale * np.array(each.transform) for each in (a, b)), rtol=1e-3, atol=1e-3)
+    return np.allclose(*(world.scale * np.array(world.transform) for world in (a, b)), rtol=1e-3, atol=1e-3)
 
 
 @dataclass(frozen=True)
 class World:
-    """Frame of the scene: transform from the capture, x_scene = scale * (transform @ [x_capture, 1]), up, metres."""
+    """Frame of the scene: transform from the capture as in `WorldEntry`, up, metres."""
 
     transform: npt.ArrayLike = field(default_factory=lambda: np.eye(4)[:3])  # [3, 4] (the dataparser's)
     scale: float = 1.0  # the dataparser's

@@ -64,9 +64,8 @@ def write_bundle(
     """Write a bundle and read it, before it replaces an earlier one; the folder appears complete or not at all.
 
     Args:
-        scene: on the CPU, all numbers finite; its own atlas is ignored. Mean residuals are also added to the colour
-            that other viewers show. Mean alphas are required by, and written with, an atlas with alphas.
-        atlas: of the texels, an `EncodedAtlas` where there are no codes; None for a scene without texture.
+        scene: on the CPU, all numbers finite; its own atlas is ignored. An atlas with alphas requires mean alphas.
+        atlas: of the texels, an `EncodedAtlas` where there are no codes; None: no texture.
         codes: codes of surfels and texels, for a compact bundle; scene and atlas must be decoded from them.
         statistics: of the bake (`statistics.Statistics`).
         extra_files: further files by name, such as preview.png.
@@ -75,7 +74,7 @@ def write_bundle(
         interchange: also write surfels.ply into a compact bundle, for other programs.
         poster: [H, W, 3] picture of the viewer's first view.
 
-    Returns the bundle as read. Raises BundleError: the target exists or cannot be written, a parameter is not finite or
+    Returns the bundle as read. Raises BundleError: the target exists or cannot be written, a value is not finite or
     beyond its limit (`limits.py`, `manifest.py`), or what was written cannot be read."""
     folder = Path(folder)
     surfels = scene.surfels
@@ -115,7 +114,7 @@ def write_bundle(
             except BundleError as error:
                 raise BundleError(f"{folder} was not written, since it could not be read: {error}") from error
             if notes is not None and not same_frame(read_manifest(folder).world, bundle.info.world):
-                kept = f"{folder / NOTES} is kept, and is in the frame of the earlier scene, not in this one's"
+                kept = f"{folder / NOTES} is kept, in the frame of the earlier scene"
                 warnings.warn(f"{kept}: check its views, notes and crops, or remove it", stacklevel=2)
         return bundle
     except OSError as error:
@@ -127,7 +126,7 @@ def write_bundle(
 
 
 def _compact_parts(codes: SceneCodes, info: dict[str, Any]) -> dict[str, bytes]:
-    """Encode surfels.bin and, if there are texels, texels.bin, adding their description to `info`."""
+    """Encode surfels.bin and texels.bin, adding their description to `info`."""
     digest = hashlib.sha256()
     of_surfels, surfels = compact.encode_surfels(
         codes.surfels, codes.residual, codes.residual_step, codes.alpha, digest
@@ -205,7 +204,7 @@ def _has_alpha(atlas: Atlas | None) -> bool:
 
 
 def _check_alpha(scene: BakedScene, atlas: Atlas | None, codes: SceneCodes | None) -> None:
-    """Check that atlas and codes agree on having alphas, and that an atlas with alphas has mean alphas in range."""
+    """Check that atlas and codes agree on having alphas, and that mean alphas are in range."""
     if codes is not None and codes.texels is not None and (codes.alpha is not None) != _has_alpha(atlas):
         raise BundleError("the atlas and the codes of the texels disagree whether there are alphas")
     if not _has_alpha(atlas):

@@ -16,17 +16,15 @@ STRIP = 64  # rows per encoder call: enough calls for all threads and for progre
 
 
 def bc7_encoder(profile: Profile, alpha: bool = False) -> Callable[[npt.NDArray[np.uint8]], bytes]:
-    """Return a function that encodes RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks in row-major order;
-    without `alpha` all alphas are 255. Raises RuntimeError: it is not installed. Raises ValueError: unknown profile."""
+    """Return a function that encodes RGBA texels [h, w, 4] (sides multiples of 4) to BC7 blocks, row by row; without
+    `alpha` all alphas are 255. Raises RuntimeError: the encoder is not installed; ValueError: unknown profile."""
     try:
         import ispc_texcomp
     except ImportError as error:
-        raise RuntimeError(
-            "BC7 needs the encoder ispc_texcomp: `pip install ispc_texcomp` (Python 3.11 or later), or choose another "
-            "format"
-        ) from error
+        remedy = "`pip install ispc_texcomp` (Python 3.11 or later), or choose another format"
+        raise RuntimeError(f"BC7 needs the encoder ispc_texcomp: {remedy}") from error
     if profile not in WITH_ALPHA:
-        raise ValueError(f"the BC7 profile must be slow, basic, fast, veryfast or ultrafast, not {profile!r}")
+        raise ValueError(f"the BC7 profile must be {', '.join(WITH_ALPHA)}, not {profile!r}")
     settings = ispc_texcomp.BC7EncSettings.from_profile(WITH_ALPHA[profile] if alpha else profile)
 
     def compress(rgba: npt.NDArray[np.uint8]) -> bytes:

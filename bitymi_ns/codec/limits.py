@@ -1,8 +1,5 @@
-"""Limits of the values in the files of a bundle.
-
-They lie far beyond what training reaches (an optimiser moves a parameter by at most its learning rate per step) and
-keep every number of a renderer finite and every channel of a picture at most `BRIGHTEST`.
-"""
+"""Limits of the values in a bundle, far beyond what training reaches. They keep every number of a renderer finite and
+every channel of a picture at most `BRIGHTEST`."""
 
 import torch
 from torch import Tensor
@@ -27,8 +24,7 @@ LIMITS: dict[str, Limit] = {
 
 
 def limit_of(name: str, kind: str) -> Limit:
-    """Return the largest absolute values of a parameter, as in `LIMITS`, of view_terms or mean_residual; else
-    infinite."""
+    """Return the largest absolute values of a parameter or of view_terms, as in `LIMITS`; else infinite."""
     return VIEW_COLORS[kind].reduced_limit if name == "view_terms" else LIMITS.get(name, (float("inf"),))
 
 
@@ -40,6 +36,6 @@ def beyond(name: str, kind: str, values: Tensor) -> Tensor:
 
 
 def within(surfels: Tensors, kind: str) -> Tensor:
-    """Compute the mask [N] of surfels whose parameters ([N, ...] each) all keep their limits."""
+    """Compute the mask [N] of surfels whose parameters [N, ...] all keep their limits."""
     bad = [beyond(name, kind, value.detach()) for name, value in surfels.items()]
-    return ~torch.stack([each.unsqueeze(-1).flatten(1).any(1) for each in bad]).any(0)
+    return ~torch.stack([mask.unsqueeze(-1).flatten(1).any(1) for mask in bad]).any(0)

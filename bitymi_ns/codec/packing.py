@@ -27,7 +27,7 @@ class Packing:
 
     @property
     def of_tiles(self) -> npt.NDArray[np.bool_]:
-        """[T] whether a texel of the list (`pages.py`) belongs to a tile; the others are constants."""
+        """[T] whether a texel of the list (`pages.py`) belongs to a tile."""
         sides = self.tiles[:, 3:].astype(np.int64)
         return np.repeat(sides[:, 0] > 0, sides.clip(min=1).prod(axis=1))
 
@@ -36,11 +36,10 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
     """Pack tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).
 
     Tiles are sorted by r_v descending, then r_u descending, then index; each goes to the first shelf with room, or
-    opens a new shelf of its own height. Sides are powers of two, so the tiles of one size are placed by arithmetic,
-    shelf starts are multiples of their height, and page boundaries never cut a shelf. The result is deterministic.
-    `resolution`: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) for a surfel without a tile. `page_width`: a
-    power of two; smaller atlases get narrower pages. `max_rows`: 8192 is the limit of WebGPU and phones. Raises
-    ValueError: sizes are not powers of two or too wide, or more than `max_layers` pages would be needed."""
+    opens a new shelf of its own height. Sides are powers of two, so tiles of one size are placed by arithmetic, and
+    page boundaries never cut a shelf. `resolution`: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) without a
+    tile. `page_width`: a power of two; smaller atlases get narrower pages. `max_rows`: 8192 is the limit of WebGPU and
+    phones. Raises ValueError: sizes are not powers of two or too wide, or more than `max_layers` pages are needed."""
     sizes = np.asarray(resolution, dtype=np.int64).reshape(-1, 2)
     _check_sizes(sizes, page_width, max_rows)
     tiles = np.zeros((len(sizes), 5), dtype=np.int32)
@@ -80,10 +79,8 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
 
     layers = -(-rows // max_rows)
     if layers > max_layers:
-        raise ValueError(
-            f"the atlas needs {layers} pages of {width} x {max_rows} texels, more than {max_layers}: "
-            "lower r_max, cap tiles by the training views, or widen the pages"
-        )
+        needed = f"the atlas needs {layers} pages of {width} x {max_rows} texels, more than {max_layers}"
+        raise ValueError(f"{needed}: lower r_max, cap tiles by the training views, or widen the pages")
     step = max(ROWS, tallest) if rows >= ROWS else GRID
     height = -(-rows // layers // step) * step
     tiles[order, 0] = origins[:, 0]
@@ -94,7 +91,7 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
 
 
 def check_page(page_width: int, max_rows: int) -> None:
-    """Check the page size. Raises ValueError: the width or the height is not allowed."""
+    """Raise ValueError if a page's width or height is not allowed."""
     if page_width < GRID or page_width & (page_width - 1):
         raise ValueError(f"the page width must be a power of two of at least {GRID}, not {page_width}")
     if max_rows < ROWS or max_rows % ROWS:

@@ -22,20 +22,20 @@ def joined(colors: Tensor, alphas: Tensor | None) -> Tensor:
 
 
 def size_classes(sizes: Tensor) -> list[tuple[int, int, Tensor]]:
-    """Group surfels by tile size [N, 2], ascending, without those that have no tile: (r_u, r_v, rows [M] int64)."""
+    """Group the surfels with a tile by its size, of [N, 2], ascending: (r_u, r_v, rows [M] int64)."""
     # one integer per pair: torch.unique over rows is many times slower
     keys, inverse = torch.unique((sizes[:, 0].long() << 32) + sizes[:, 1].long(), return_inverse=True)
-    found = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
+    pairs = torch.stack([keys >> 32, keys & 0xFFFFFFFF], dim=1)
     return [
         (int(r_u), int(r_v), torch.nonzero(inverse == i).squeeze(1))
-        for i, (r_u, r_v) in enumerate(found.tolist())
+        for i, (r_u, r_v) in enumerate(pairs.tolist())
         if r_u > 0 and r_v > 0
     ]
 
 
 def listed_tiles(sizes: Tensor, chunk: int = 1 << 20) -> Iterator[tuple[tuple[int, int], Tensor, Tensor]]:
-    """Yield the tiles of a texel list in chunks of one size [N, 2], about `chunk` texels each, without surfels that
-    have no tile: (r_u, r_v), rows [n] int64 of the surfels, texel rows [n, r_v, r_u] int64."""
+    """Yield the tiles of a texel list, given their sizes [N, 2], in chunks of one size and about `chunk` texels:
+    (r_u, r_v), rows [n] int64 of the surfels, texel rows [n, r_v, r_u] int64."""
     first = first_texels(sizes)
     for r_u, r_v, members in size_classes(sizes):
         inside = torch.arange(r_u * r_v, device=sizes.device).view(r_v, r_u)
@@ -51,7 +51,7 @@ def first_texels(sizes: Tensor) -> Tensor:
 
 def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -> Tensor:
     """Compute the flat index (layer * height + y) * width + x, [N, r_v, r_u] int64, of each texel of tiles [N, 5] int32
-    (x, y, layer, r_u, r_v) of one size (r_u, r_v) in pages of `width` x `height` texels."""
+    (x, y, layer, r_u, r_v) of one size in pages of `width` x `height` texels."""
     x, y, layer = tiles[:, 0].long(), tiles[:, 1].long(), tiles[:, 2].long()
     origin = (layer * height + y) * width + x  # [N]
     i, j = (torch.arange(side, device=tiles.device) for side in size)
@@ -59,8 +59,7 @@ def texel_index(tiles: Tensor, size: tuple[int, int], width: int, height: int) -
 
 
 def tile_means(texels: Tensor, sizes: Tensor) -> Tensor:
-    """Compute the mean [N, C] of each tile of a texel list [T, C], given tile sizes [N, 2]. With a fourth channel
-    (alpha), colours are weighted by alpha unless all of a tile's alphas are 0."""
+    """Compute the mean [N, C] of each tile of a texel list [T, C], given tile sizes [N, 2]; C = 4: as `alpha_means`."""
     means = texels[first_texels(sizes)]
     for _, rows, index in listed_tiles(sizes):
         values = texels[index]
@@ -77,8 +76,8 @@ def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
-    """Gather pages [layers, height, width, C] into a texel list [T, C]; surfels without a tile get their row of
-    `constants` [N, C]."""
+    """Gather pages [layers, height, width, C] into a texel list [T, C], with `constants` [N, C] for surfels without a
+    tile."""
     area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
     texels = constants.repeat_interleave(area, dim=0)
     for listed, paged in _texel_rows(packing):
@@ -96,8 +95,8 @@ def paged_texels(texels: Tensor, packing: Packing, elsewhere: float = 0.0) -> Te
 
 
 def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
-    """Return the alpha texels of a scene on its device, the mean alpha for a surfel without a tile; None if it has no
-    alpha. Raises ValueError: the atlas exists only as BC7 blocks."""
+    """Return the alpha texels of a scene on its device, with mean alphas for surfels without a tile; None: no alpha.
+    Raises ValueError: the atlas exists only as BC7 blocks."""
     alphas, device = scene.alphas(), scene.tiles.device
     if alphas is None and scene.mean_alpha is None:
         return None

@@ -35,7 +35,7 @@ class Range:
     rule: str
 
     def to_unorm8(self, values: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
-        """Quantise `values` to the nearest 8-bit codes, clipped to the range."""
+        """Quantise to the nearest 8-bit codes, clipped to the range."""
         unorm = (values - np.float32(self.offset)) * np.float32(1.0 / self.scale)
         return np.rint(np.clip(unorm, 0.0, 1.0) * 255.0).astype(np.uint8)
 
@@ -86,18 +86,18 @@ class EncodedAtlas(Atlas):
 def choose_range(
     texels: npt.NDArray[np.float32], rule: RangeRule = "sigma6", samples: int = 1 << 18, seed: int = 0
 ) -> Range:
-    """Choose the quantisation range of an atlas, shared by its three colour channels.
+    """Choose the quantisation range of an atlas's three colour channels.
 
     sigma6: mean +- 6 standard deviations of a bootstrap sample (paper, Quantization). minmax: smallest to largest
-    value, nothing clipped. auto: the one with the smaller mean squared 8-bit error on the sample. `texels`: [T, C]
-    float32 texels of the tiles. `samples`: size of the bootstrap sample, uniform over the texels, with replacement."""
+    value. auto: the one with the smaller mean squared 8-bit error on the sample. `texels`: [T, C] float32 texels of the
+    tiles. `samples`: size of the sample."""
     if len(texels) == 0:
         return Range(0.0, 1.0, rule if rule != "auto" else "sigma6")
     sample = texels[np.random.default_rng(seed).integers(0, len(texels), samples), :3]
     if rule == "auto":
-        candidates = [choose_range(texels, each, samples, seed) for each in ("sigma6", "minmax")]
-        lost = [each.from_unorm8(each.to_unorm8(sample)) - sample for each in candidates]
-        return candidates[int(np.argmin([np.square(each.astype(np.float64)).mean() for each in lost]))]
+        candidates = [choose_range(texels, name, samples, seed) for name in ("sigma6", "minmax")]
+        errors = [candidate.from_unorm8(candidate.to_unorm8(sample)) - sample for candidate in candidates]
+        return candidates[int(np.argmin([np.square(error.astype(np.float64)).mean() for error in errors]))]
     if rule == "sigma6":
         values = sample.astype(np.float64)
         mean, spread = float(values.mean()), 6.0 * float(values.std())
@@ -122,9 +122,9 @@ def encode(
     progress: Progress = no_progress,
 ) -> EncodedAtlas:
     """Quantise and encode texels [layers, height, width, C] float32, residual colours and, where C = 4, alphas, and
-    measure the error of the stored colours inside the tiles. `format`: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16
-    (RGBA half floats, 8). `value_range`: not used by fp16; None: `choose_range` with its defaults. `threads`: of the
-    encoder, without effect on the result; None: one per processor."""
+    measure the error of the colours inside the tiles. `format`: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA
+    half floats, 8). `value_range`: not used by fp16; None: `choose_range` with its defaults. `threads`: of the encoder;
+    None: one per processor."""
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")
     layers, height, width, channels = texels.shape
@@ -170,7 +170,7 @@ def encode(
 
 
 def round_to_bytes(texels: Tensor, packing: Packing, value_range: Range) -> tuple[Atlas, Tensor]:
-    """Round decoded texels [T, C] of a compact bundle as its readers do: the atlas, and its `byte_pages`."""
+    """Round decoded texels [T, C] of a compact bundle as its readers do, to the atlas and its `byte_pages`."""
     colors = texels.numpy()[packing.of_tiles, :3]
     clipped, squares = _errors(colors, value_range.from_unorm8(value_range.to_unorm8(colors)), value_range)
     atlas = Atlas(
@@ -188,15 +188,15 @@ def round_to_bytes(texels: Tensor, packing: Packing, value_range: Range) -> tupl
 
 
 def byte_pages(texels: Tensor, packing: Packing, value_range: Range) -> Tensor:
-    """Round listed texels [T, C] and lay them out as pages [layers, height, width, 4] uint8. They are rounded first, so
-    that each moves as one int32."""
+    """Round listed texels [T, C] and lay them out as pages [layers, height, width, 4] uint8."""
     zero = torch.zeros(1, texels.shape[1])
-    listed, nothing = (torch.from_numpy(_quantised(each.numpy(), "uint8", value_range)) for each in (texels, zero))
+    listed, nothing = (torch.from_numpy(_quantised(part.numpy(), "uint8", value_range)) for part in (texels, zero))
+    # as int32, so that each texel moves at once
     return paged_texels(listed.view(torch.int32), packing, int(nothing.view(torch.int32))).view(torch.uint8)
 
 
 def _errors(values: npt.NDArray[np.float32], decoded: npt.NDArray[np.float32], value_range: Range) -> tuple[int, float]:
-    """Count colour values outside the range, and sum the squares of the errors of the decoded ones."""
+    """Count colour values outside the range, and sum the squared errors of the decoded ones."""
     low, high = value_range.offset, value_range.offset + value_range.scale
     slack = 1e-6 * (high - low)  # the extremes may round to float32 just outside
     clipped = int(((values < low - slack) | (values > high + slack)).sum())
@@ -204,8 +204,8 @@ def _errors(values: npt.NDArray[np.float32], decoded: npt.NDArray[np.float32], v
 
 
 def decode_pages(payload: Sequence[bytes | memoryview], format: Format, width: int, height: int) -> np.ndarray:
-    """Decode an atlas's pages to stored texels [layers, height, width, 4]: uint8 for bc7 and uint8, float16 for fp16.
-    Raises ValueError: a page has the wrong number of bytes."""
+    """Decode pages to stored texels [layers, height, width, 4], float16 for fp16, else uint8. Raises ValueError: a page
+    has the wrong number of bytes."""
     dtype = np.float16 if format == "fp16" else np.uint8
     pages = np.empty((len(payload), height, width, 4), dtype=dtype)
     for page, data in zip(pages, payload, strict=True):
@@ -231,7 +231,7 @@ def dequantised(pages: np.ndarray, value_range: Range, alpha_scale: float = 0.0)
 
 
 def _quantised(values: npt.NDArray[np.float32], format: Format, value_range: Range) -> np.ndarray:
-    """Quantise to RGBA texels [..., 4], uint8 or little-endian float16; opaque texels get full alpha."""
+    """Quantise to RGBA texels [..., 4], uint8 or little-endian float16."""
     alpha = values[..., 3] if values.shape[-1] == 4 else None
     if format == "fp16":
         rgba = np.ones((*values.shape[:-1], 4), dtype="<f2")

@@ -39,8 +39,8 @@ def compress(codes: npt.NDArray[np.integer]) -> Compressed:
 
 
 def decompress(view: memoryview, rows: int, sizes: Sequence[int], blocks: int = 0) -> npt.NDArray[np.int64]:
-    """Decompress what `compress` returned to int64 [rows, n]; rows are coefficients x blocks if there are `blocks`.
-    Raises StreamError: the bytes are damaged or do not match `rows` and `sizes`."""
+    """Decompress what `compress` returned to int64 [rows, n], rows = coefficients * blocks with `blocks`. Raises
+    StreamError: the bytes are damaged or do not match `rows` and `sizes`."""
     if sum(sizes) != len(view):
         raise StreamError(f"the numbers have {sum(sizes)} bytes, not {len(view)}")
     numbers, at, module = np.empty((len(sizes), rows), dtype=np.int64), 0, load("_cpu")

@@ -48,8 +48,8 @@ def columns_of(kind: str, has_alpha: bool, stated: Collection[str] | None = None
 
 @dataclass(frozen=True)
 class PositionGrid:
-    """Grid of positions: x = center + scale sinh(low + step k), per axis, with integers k >= 0. Cells are about uniform
-    within `scale` of the centre and grow with the distance beyond."""
+    """Grid of positions: x = center + scale sinh(low + step k), per axis, with integers k >= 0: about uniform within
+    `scale` of the centre, growing with the distance beyond."""
 
     # center, low: per axis
     center: tuple[float, float, float]
@@ -65,10 +65,10 @@ class SurfelCodes:
     frame: PositionGrid
     steps: Mapping[str, float]  # quantisation step by column, as in `REFERENCE`
     # column to [rows, numbers] int64. place [N, 1]: ascending Morton codes of the cells: bit 3 i + a is bit i along
-    # axis a. largest [N, 1]: index of the quaternion component (wxyz) of largest size, made positive; rotation [N, 3]:
-    # the others. log_scales [N, 2], opacity [N, 1], beta [N, 1]. size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
+    # axis a. largest [N, 1]: index of the largest quaternion component (wxyz), made positive; rotation [N, 3]: the
+    # others. log_scales [N, 2], opacity [N, 1], beta [N, 1]. size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
     # extent [tiles, 1]: half sides of the tiles. view_base [N, 3], view_count [N, 1]: base colour and number of terms.
-    # term_shape, term_color [T, ...]: numbers of the terms, colours apart. Colours are green, red - green, blue - green
+    # term_shape, term_color [T, ...]: numbers of the terms. Colours are green, red - green, blue - green
     codes: Mapping[str, Codes]
 
     def __len__(self) -> int:
@@ -109,9 +109,9 @@ class SurfelCodes:
             "view_base": self.steps["view_base"] * from_differences(self.codes["view_base"]),
             "view_terms": terms,
         }
-        found = {name: _clip_to_limits(name, self.kind, value) for name, value in values.items()}
+        surfels = {name: _clip_to_limits(name, self.kind, value) for name, value in values.items()}
         span = np.stack([np.cumsum(count) - count, count], axis=1).astype(np.int32)
-        return {**found, "view_span": torch.from_numpy(span)}
+        return {**surfels, "view_span": torch.from_numpy(span)}
 
     def _linear(self, name: str) -> npt.NDArray[np.float64]:
         return self.steps[name] * self.codes[name]
@@ -205,7 +205,7 @@ def morton_cells(codes: Codes) -> Codes:
 
 
 def _grid_cells(means: npt.NDArray[np.float64], step: float) -> tuple[PositionGrid, float, Codes]:
-    """Fit the grid to positions [N, 3]: the grid, its step, and the cells [N, 3]."""
+    """Fit the grid to positions [N, 3]; returns it, its step, and the cells [N, 3]."""
     center = np.median(means, axis=0)
     scale = float(np.median(np.abs(means - center))) or 1.0
     bent = np.arcsinh((means - center) / scale)

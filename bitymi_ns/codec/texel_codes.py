@@ -26,8 +26,7 @@ STEP = 7.5  # of coefficients, 8-bit steps, where nothing decides it
 LEAST_WEIGHT = 1e-3  # added to the weight of a texel, pixels, so that unseen texels stay near their values
 SPARSE_ROUNDS = 8  # ISTA iterations, which shrink coefficients that only unseen texels need
 ALPHA_GAIN = 6.0
-"""Step of alphas relative to residual colours: an alpha error costs the contrast between a surfel and its background.
-At equal bytes 4 to 8 give the same PSNR."""
+"""Step of alphas relative to residual colours; at equal bytes 4 to 8 give the same PSNR."""
 SHRINK = 0.6  # soft threshold of an iteration relative to the step, for equally weighted texels
 _ATTEMPTS = 16
 _SMALLEST_STEP, _LARGEST_STEP = 1e-5, 50.0
@@ -40,7 +39,7 @@ _CHANNELS = {3: _OPPONENT, 1: torch.ones(1, 1, dtype=torch.float32)}
 
 @dataclass(frozen=True)
 class Blocks:
-    """Blocks of one size of all tiles, sorted by surfel, row and column."""
+    """All tiles' blocks of one size, sorted by surfel, row and column."""
 
     size: tuple[int, int]  # (b_u, b_v) texels
     tile: Tensor  # [B] int64 index among the surfels that have a tile
@@ -61,16 +60,16 @@ class Blocks:
 def blocks_of(sizes: Tensor) -> list[Blocks]:
     """Split tiles of sizes [N, 2] into blocks, grouped and sorted by (b_u, b_v)."""
     first, number = first_texels(sizes), (sizes[:, 0] > 0).long().cumsum(0) - 1
-    found: dict[tuple[int, int], list[tuple[Tensor, Tensor]]] = {}
+    parts: dict[tuple[int, int], list[tuple[Tensor, Tensor]]] = {}
     for r_u, r_v, rows in size_classes(sizes):
         b_u, b_v = min(r_u, BLOCK), min(r_v, BLOCK)
         tile = torch.arange(r_u * r_v).view(r_v // b_v, b_v, r_u // b_u, b_u).transpose(1, 2).reshape(-1, b_v, b_u)
         texels = first[rows, None, None, None] + tile
         owner = number[rows].repeat_interleave(len(tile))
-        found.setdefault((b_u, b_v), []).append((owner, texels.reshape(-1, b_v, b_u)))
+        parts.setdefault((b_u, b_v), []).append((owner, texels.reshape(-1, b_v, b_u)))
     blocks = []
-    for size in sorted(found):
-        owner, texels = (torch.cat(parts) for parts in zip(*found[size], strict=True))
+    for size in sorted(parts):
+        owner, texels = map(torch.cat, zip(*parts[size], strict=True))
         order = torch.argsort(owner, stable=True)
         blocks.append(Blocks(size, owner[order], texels[order]))
     return blocks
@@ -92,8 +91,8 @@ class AlphaCodes:
     def values(self, sizes: Tensor, grades: Tensor) -> Tensor:
         """Decode the alphas [T] float32 of tiles of sizes [N, 2] and grades [tiles]: bytes / 128, as drawn."""
         steps = _steps(self.step, grades)
-        found = _decode(self.means[:, None], self.coefficients, blocks_of(sizes), sizes, steps)
-        return _round_to_bytes(found[:, 0]) / ALPHA_ONE
+        alphas = _decode(self.means[:, None], self.coefficients, blocks_of(sizes), sizes, steps)
+        return _round_to_bytes(alphas[:, 0]) / ALPHA_ONE
 
 
 @dataclass(frozen=True)
@@ -199,10 +198,9 @@ class TexelCoder:
 
     def __init__(self, sizes: Tensor, weights: Tensor, step: float = STEP, first: TexelCodes | None = None) -> None:
         """Take tiles of sides `sizes` [N, 2], (0, 0) = one constant, and texel weights [T], in the order of
-        `TexelTiles`: sum over views and fragments of the squared blending weight times the bilinear weight. A texel
-        error e adds weight times e^2 to the pictures. `step`: of a coefficient, in 8-bit steps, for texels that cover
-        one pixel of the views; step / sqrt(w) if they cover w pixels. `first`: earlier codes, whose alphas and grades
-        are kept; None: start afresh."""
+        `TexelTiles`: sum over views and fragments of the squared blending weight times the bilinear weight, so that a
+        texel error e adds weight times e^2 to the pictures. `step`: of a coefficient, in 8-bit steps, for texels that
+        cover one pixel of the views; step / sqrt(w) if w pixels. `first`: codes whose alphas and grades are kept."""
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
         self._step = step / 255
         self.blocks = blocks_of(self._sizes)
@@ -219,10 +217,10 @@ class TexelCoder:
         as 1 / step."""
         codes = self.code(texels, rounds)
         for _ in range(_ATTEMPTS):
-            found = codes.nbytes()
-            if found <= most_bytes:
+            size = codes.nbytes()
+            if size <= most_bytes:
                 break
-            self._step = min(_LARGEST_STEP, self._step * min(4.0, max(1.06, (found / most_bytes) ** 1.2)))
+            self._step = min(_LARGEST_STEP, self._step * min(4.0, max(1.06, (size / most_bytes) ** 1.2)))
             codes = self.code(texels, rounds)
         return codes
 
@@ -246,15 +244,14 @@ class TexelCoder:
         step = ALPHA_GAIN * self._step
         mean = _round_to_bytes(self._means(alpha[:, None])[:, 0])
         codes = AlphaCodes(mean.numpy().astype(np.int64), step, [])
-        found = self._coefficients(alpha[:, None], codes.means[:, None], step, rounds)
-        self.alpha = replace(codes, coefficients=found)
+        coefficients = self._coefficients(alpha[:, None], codes.means[:, None], step, rounds)
+        self.alpha = replace(codes, coefficients=coefficients)
         return self.alpha.values(self._sizes, self.grades)
 
     @torch.no_grad()
     def code(self, texels: Tensor, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Code texels [T, 3], with the alphas coded before. Coefficients c minimise sum over texels of weight (t -
-        t(c))^2 plus an L1 penalty, by `rounds` iterations of ISTA (a gradient step and soft thresholding). Unseen
-        texels thus take the values that cost least."""
+        """Code texels t [T, 3], with the alphas coded before. Coefficients c minimise the sum of weight (t - t(c))^2
+        plus an L1 penalty, by `rounds` iterations of ISTA, so that unseen texels take the values that cost least."""
         residual = residual_codes(self._means(texels))
         codes = TexelCodes(self._sizes, self._step, residual, RESIDUAL_STEP, self.grades, [], self.alpha)
         return replace(codes, coefficients=self._coefficients(texels, codes.constants, self._step, rounds))
@@ -277,14 +274,13 @@ def _decode(
     """Decode texels [T, C] from means [N, C] and coefficients of tiles of sizes [N, 2] and steps [tiles]."""
     texels = means.repeat_interleave(sizes.clamp(min=1).prod(dim=1), dim=0)
     shared = _shared(means, sizes, steps)
-    for of, codes in zip(blocks, coefficients, strict=True):
-        backend.load("_cpu").decode_cosines_f32(**shared, **_block_arguments(of), codes=codes, values=texels)
+    for group, codes in zip(blocks, coefficients, strict=True):
+        backend.load("_cpu").decode_cosines_f32(**shared, **_block_arguments(group), codes=codes, values=texels)
     return texels
 
 
 def _shared(means: Tensor, sizes: Tensor, steps: Tensor) -> dict[str, Any]:
-    """Build the arguments of csrc/cpu/kernels.h for all blocks. The kernels run on the CPU: codes do not depend on the
-    renderer's device."""
+    """Build the arguments of csrc/cpu/kernels.h for all blocks."""
     channels = means.shape[1]
     of_tiles = means[sizes[:, 0] > 0].contiguous()
     return {"mean": of_tiles, "step": steps, "mix": _CHANNELS[channels], "channels": channels}

@@ -1,4 +1,4 @@
-"""Extras of a bundle, for other programs: Gaussians, flat Gaussians, OpenUSD surflets, and a textured mesh."""
+"""Extras of a bundle for other programs: Gaussians, flat Gaussians, OpenUSD surflets, a textured mesh."""
 
 import json
 from collections.abc import Sequence
@@ -36,9 +36,9 @@ FILES: dict[str, str] = {
 }
 DEFAULT: tuple[Kind, ...] = ("gaussians", "mesh")
 SUMMARY = "extras.json"
-SUFFIX = ".extras"  # suffix of the folder beside a bundle
+SUFFIX = ".extras"  # of the folder beside a bundle
 LEVEL = 0.15  # opacity at which the quads of a mesh end
-SEEN_SIDE, COLORED_SIDE = 400, 800  # longer side in pixels of the images for visibility, and for a mesh's colours
+SEEN_SIDE, COLORED_SIDE = 400, 800  # longer side in pixels of the views for visibility, and for a mesh's colours
 COLORED_VIEWS = 64  # most training views that colour a mesh
 
 
@@ -51,19 +51,19 @@ class ExtraFile:
 
 
 def training_cameras(bundle: Bundle) -> Sequence[Camera]:
-    """List the cameras of the training photographs; empty if the bundle has no cameras.json."""
+    """List the cameras of the training photographs; empty without cameras.json."""
     return [row.camera for row in bundle.cameras if not row.held_out]
 
 
 def extras_folder(bundle: Path) -> Path:
-    """Return the default folder of a bundle's extras: beside the bundle, with its name and `SUFFIX`."""
+    """Return the default folder of a bundle's extras, beside the bundle."""
     bundle = bundle.absolute()
     return bundle.with_name((bundle.stem if bundle.suffix == ".bitymi" else bundle.name) + SUFFIX)
 
 
 def check_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
     """Check the kinds and the output folder. Raises BundleError: a kind does not exist, or needs OpenUSD, which is not
-    installed; or the folder exists and `overwrite` is False, or it holds other files."""
+    installed; or the folder exists without `overwrite`, or holds other files."""
     unknown = [kind for kind in kinds if kind not in FILES]
     if unknown or not kinds:
         what = f"there is no extra {unknown[0]!r}" if unknown else "no extra is asked for"
@@ -81,13 +81,13 @@ def _removed_by(kinds: Sequence[str], folder: Path) -> list[str]:
 
 
 def removal_line(kinds: Sequence[str], folder: Path) -> str:
-    """Name the files of an earlier folder that extras of these kinds remove, as they may be of another bundle."""
+    """Name the files of an earlier folder that writing these kinds removes."""
     lost = _removed_by(kinds, folder)
     return f"Removed {', '.join(lost)} of the earlier {folder}: ask for all kinds that you want." if lost else ""
 
 
 def reserve_extras(kinds: Sequence[str], folder: Path, overwrite: bool) -> None:
-    """Check in advance that extras can be written to a folder; raises BundleError as `write_extras`."""
+    """Check that extras can be written to a folder. Raises BundleError."""
     with write_errors_as(folder, BundleError), reserved(folder, partial(check_extras, kinds, folder, overwrite)):
         pass
 
@@ -102,12 +102,11 @@ def write_extras(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> dict[str, ExtraFile]:
-    """Write a folder with a file per kind and extras.json, which states them; return these by kind. The folder is
-    complete or absent. `bundle`: on the CPU, texels decoded. `frame`: of the files: the scene's or the capture's, by
-    the transform of bundle.json. `cameras`: of the training photographs, to fit colours to. Without cameras harmonics
-    are fitted over the whole sphere, and a mesh keeps the surfels' colours. Raises BundleError: as `check_extras`; the
-    bundle has no surfel for a mesh; the transform to the capture's frame is no similarity; or the folder cannot be
-    written."""
+    """Write a folder, complete or not at all, with a file per kind and extras.json, which states them; return these by
+    kind. `bundle`: on the CPU, texels decoded. `frame`: of the files, the scene's or the capture's. `cameras`: of the
+    training photographs, to fit colours to; without any, harmonics are fitted over the whole sphere, and a mesh keeps
+    the surfels' colours. Raises BundleError: as `check_extras`; there is no surfel for a mesh; the transform to the
+    capture's frame is no similarity; or the folder cannot be written."""
     folder = Path(folder)
     reserve_extras(kinds, folder, overwrite)
     to = to_capture(bundle.info.world) if frame == "capture" else None
@@ -124,7 +123,7 @@ def write_extras(
         return made if to is None else made.moved(to)
 
     def write(kind: Kind, path: Path) -> int:
-        """Write a file; returns its number of Gaussians or quads."""
+        """Write a file; return its number of Gaussians or quads."""
         if kind == "mesh":
             quads = quads_of(scene, colors.color, LEVEL)
             if not len(quads):
@@ -147,7 +146,7 @@ def write_extras(
             count = write(kind, path)
             written[kind] = ExtraFile(path.name, path.stat().st_size, count, note)
         summary = {"frame": frame, "training_views": len(cameras)}
-        summary |= {kind: asdict(each) for kind, each in written.items()}
+        summary |= {kind: asdict(file) for kind, file in written.items()}
         (new / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", "utf8")
     return written
 

@@ -12,7 +12,7 @@ from bitymi_ns.bundle.manifest import BundleError
 from bitymi_ns.bundle.world import WorldEntry
 
 FARTHEST = 1_000.0
-"""Distance, in scene units (cameras in [-1, 1]), beyond which positions get an origin: float32 is off by 1/30,000."""
+"""Distance in scene units beyond which positions get an origin: float32 is off by 1/30,000."""
 _UP = (0.0, 0.0, 1.0)  # nerfstudio's, if the bundle states none
 _TOLERANCE = 1e-4  # tolerance of a stored rotation's orthogonality
 
@@ -34,12 +34,11 @@ class Similarity:
         return "positions are relative to the origin " + " ".join(f"{value:.15g}" for value in self.origin.tolist())
 
     def points(self, points: Tensor) -> Tensor:
-        """Transform points [..., 3] to the new frame, relative to the origin, in their dtype."""
+        """Transform points [..., 3], in their dtype, relative to the origin."""
         return (self.scale * (points.double() @ self.turn.T) + self.shift).to(points)
 
     def rotations(self, quats: Tensor) -> Tensor:
-        """Transform rotations to the new frame, [N, 4] float64 unit quaternions wxyz; for a reflection with the third
-        axis inverted."""
+        """Transform rotations to [N, 4] float64 unit quaternions wxyz; a reflection inverts the third axis."""
         old = Rotation.from_quat(quats.detach().double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
         new = self.turn.numpy() @ old
         new[:, :, 2] *= np.linalg.det(self.turn.numpy())
@@ -53,10 +52,8 @@ def to_capture(place: WorldEntry) -> Similarity:
     stretch = float(torch.linalg.det(matrix).abs()) ** (1 / 3)
     turn = matrix / stretch if stretch > 0 else matrix
     if not bool(((turn @ turn.T - torch.eye(3, dtype=torch.float64)).abs() <= _TOLERANCE).all()):
-        raise BundleError(
-            "the transform from the capture's own frame to the scene's is no rotation with one scale, so that nothing "
-            "can be moved back there: choose the scene's frame (--frame scene)"
-        )
+        wrong = "the transform from the capture's frame to the scene's is no rotation with one scale"
+        raise BundleError(f"{wrong}, so that nothing can be moved back: choose the scene's frame (--frame scene)")
     u, _, v = torch.linalg.svd(turn)
     turn = u @ v  # nearest orthogonal matrix
     scale = 1 / (stretch * place.scale)
@@ -68,8 +65,8 @@ def to_capture(place: WorldEntry) -> Similarity:
 
 
 def up_of(place: WorldEntry, to: Similarity | None) -> Tensor:
-    """Compute the up direction [3] in the scene's frame, or with `to` the nearest axis of the new frame, so that a
-    rotation to +y only permutes and negates its coordinates."""
+    """Compute the up direction [3] in the scene's frame; with `to`, the nearest axis of the new frame, whose rotation
+    to +y only permutes and negates coordinates."""
     up = torch.tensor(place.up or _UP, dtype=torch.float64)
     if to is None:
         return up

@@ -1,4 +1,4 @@
-"""Baked scene as 3D Gaussians: a preview for Gaussian splatting programs."""
+"""Baked scene as 3D Gaussians."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from .frame import Similarity
 from .quads import fetch_texels
 
 FLAT_LOG_SCALE = -16.0
-"""Log of the Gaussians' third scale, in the scene's frame, whose cameras lie within a unit of the origin."""
+"""Log of the Gaussians' third scale, in the scene's frame."""
 GRID = 24  # grid points per axis of a kernel, to sum moments under alpha texels
 LEAST_OPACITY = 1e-4  # of a surfel that alpha texels cut away
 HARD_BETA = 0.5658
@@ -47,7 +47,7 @@ class Gaussians:
     log_scales: Tensor  # [N, 3] natural logarithms of the standard deviations along the axes
     opacity_logits: Tensor  # [N]
     harmonics: Tensor  # [N, 16, 3]; the colour is max(sum of harmonics Y(d) + 0.5, 0), d from the camera to the mean
-    hard: Tensor  # [N] bool, better approximated by a disc of constant opacity with a radius of two standard deviations
+    hard: Tensor  # [N] bool, better approximated by a disc of constant opacity and radius two standard deviations
 
     def __len__(self) -> int:
         return len(self.means)
@@ -68,13 +68,11 @@ class Gaussians:
 
 @torch.no_grad()
 def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
-    """Convert the surfels of a scene on the CPU to flat Gaussians with colours [N, 16, 3] of
-    `surfel_colors.fit_colors`.
+    """Convert the surfels of a scene on the CPU to flat Gaussians. `coefficients`: [N, 16, 3] of `fit_colors`.
 
     Gaussians have the opacities and second moments of the surfels' kernels: under (1 - r^2 / R^2)^beta on the disc of
     radius R the mean of u^2 is R^2 / (2 (beta + 2)). With alpha texels m they have centre and covariance of
-    f = min(0.99, o k m), and their opacity is multiplied by (f-weighted mean of f) / ((o k)-weighted mean of
-    o k).
+    f = min(0.99, o k m), and their opacity is multiplied by (f-weighted mean of f) / ((o k)-weighted mean of o k).
     """
     surfels = scene.surfels
     means, quats = surfels["means"].float(), torch.nn.functional.normalize(surfels["quats"].float(), dim=1)
@@ -133,7 +131,7 @@ def _moments(scene: BakedScene, chunk: int = 1 << 20) -> tuple[Tensor, Tensor, T
 
 
 def write_gaussians(path: str | Path, gaussians: Gaussians, comments: Sequence[str] = (), flat: bool = False) -> None:
-    """Write a 3DGS PLY file; `flat`: without the third scales, which a comment states (`FLAT`)."""
+    """Write a 3DGS PLY file; `flat`: without the third scales, and with the comment `FLAT`."""
     values = {
         "means": gaussians.means,
         "normals": torch.zeros_like(gaussians.means),

@@ -20,8 +20,8 @@ _COLOR = "_COLOR_0"  # float attribute: trimesh writes vertex colors as bytes, t
 
 
 def upright(up: Tensor, origin: Tensor | None = None) -> np.ndarray:
-    """Compute the transform [4, 4] of a glTF node, from positions relative to an origin [3] with up direction [3] to
-    glTF's frame, where +y is up."""
+    """Compute the transform [4, 4] of a glTF node from positions relative to an origin [3], with up direction `up` [3],
+    to glTF's frame with +y up."""
     place = np.eye(4)
     place[:3, :3] = _to_y(up.double().numpy())
     if origin is not None:
@@ -31,7 +31,7 @@ def upright(up: Tensor, origin: Tensor | None = None) -> np.ndarray:
 
 def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
     """Encode at least one quad as glTF: a mesh per page with the page as PNG, two triangles per quad, double-sided and
-    unlit (KHR_materials_unlit). The sampler has no mip levels, which would mix tiles. `place`: of `upright`."""
+    unlit, without mip levels, which would mix tiles. `place`: of `upright`."""
     scene = trimesh.Scene()
     for page in torch.unique(quads.page).tolist():
         rows = torch.nonzero(quads.page == page).squeeze(1)
@@ -50,8 +50,7 @@ def quads_glb(quads: Quads, place: np.ndarray) -> bytes:
 
 
 def surface_glb(mesh: Triangles, normals: np.ndarray, place: np.ndarray) -> bytes:
-    """Encode a surface with vertex normals [V, 3] as glTF: linear vertex colors, lit and double-sided. `place`: of
-    `upright`."""
+    """Encode a surface with vertex normals [V, 3] as glTF: linear vertex colors, lit, double-sided."""
     linear = np.where(mesh.colors <= 0.04045, mesh.colors / 12.92, ((mesh.colors + 0.055) / 1.055) ** 2.4)
     shape = trimesh.Trimesh(
         mesh.vertices,

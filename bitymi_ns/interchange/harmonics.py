@@ -14,15 +14,14 @@ _POWERS = [(i, j, n - i - j) for n in (2, 3) for i in range(n + 1) for j in rang
 
 def basis(directions: Tensor) -> Tensor:
     """Evaluate the harmonics, [..., 16], in directions [..., 3], unit vectors. On the sphere they are linear
-    combinations of the monomials of degrees 2 and 3, whose coefficients are solved for from values of the compiled
-    kernel, in float64, so that the formula exists once."""
+    combinations of the monomials of degrees 2 and 3; their coefficients are solved for from the compiled kernel, so
+    that the formula exists once."""
     return _monomials(directions) @ _from_monomials().to(directions)
 
 
 def rotation_of(matrix: Tensor) -> Tensor:
-    """Compute the matrix [16, 16] float64 that rotates coefficients to another frame, exactly, because rotations do not
-    mix degrees. `matrix`: [3, 3] float64, orthogonal, also a reflection: a direction d of the new frame is matrix @ d
-    in the old one."""
+    """Compute the matrix [16, 16] float64 that rotates coefficients to another frame. `matrix`: [3, 3] float64,
+    orthogonal, also a reflection: a direction d of the new frame is matrix @ d in the old one."""
     directions = fibonacci_sphere(_SAMPLES).double()
     old = basis(torch.nn.functional.normalize(directions @ matrix.T, dim=1))
     return torch.linalg.lstsq(basis(torch.nn.functional.normalize(directions, dim=1)), old).solution

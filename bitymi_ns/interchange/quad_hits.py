@@ -25,11 +25,10 @@ class QuadHits:
 
 @torch.no_grad()
 def nearest_hits(quads: Quads, camera: Camera, near: float) -> QuadHits:
-    """Find the nearest quad at each pixel.
+    """Find the nearest quad at each pixel. `near`: near plane, camera z.
 
     A ray r through a pixel, with r_z = 1, meets the plane of a quad of corner A and sides E, F (camera frame) where z r
-    = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with n = E x F. `quads`: in the
-    camera's world frame. `near`: near plane, camera z."""
+    = A + s E + t F: s = r . (F x A) / r . n, t = r . (A x E) / r . n, z = A . n / r . n with n = E x F."""
     K, viewmat = camera.K.double(), camera.viewmat.double()
     corners = quads.corners.double() @ viewmat[:3, :3].T + viewmat[:3, 3]  # [Q, 4, 3]
     low, size, rows = _boxes(corners, K, near, camera.width, camera.height)
@@ -67,8 +66,7 @@ def nearest_hits(quads: Quads, camera: Camera, near: float) -> QuadHits:
 
 
 def _boxes(corners: Tensor, K: Tensor, near: float, width: int, height: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the bounding boxes of quads in the image, clipped at the near plane: first pixels [M, 2], sizes [M, 2],
-    and quad indices [M]."""
+    """Bound quads in the image, clipped at the near plane: first pixels [M, 2], sizes [M, 2], quad indices [M]."""
     rows = torch.nonzero((corners[..., 2] > near).any(1)).squeeze(1)
     start, end = corners[rows], corners[rows].roll(-1, 1)
     along = (near - start[..., 2:]) / (end[..., 2:] - start[..., 2:])  # position along a side at the near plane
@@ -84,7 +82,7 @@ def _boxes(corners: Tensor, K: Tensor, near: float, width: int, height: int) -> 
 
 
 def _parts(counts: Tensor) -> Iterator[Tensor]:
-    """Split row indices into consecutive batches of about `_AT_ONCE` total count."""
+    """Split rows into consecutive batches of about `_AT_ONCE` pairs."""
     run = (counts.cumsum(0) - counts) // _AT_ONCE
     start = 0
     for length in torch.unique_consecutive(run, return_counts=True)[1].tolist():

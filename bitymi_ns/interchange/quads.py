@@ -26,10 +26,8 @@ class Quads:
     """Q textured parallelograms."""
 
     corners: Tensor  # [Q, 4, 3] float32 positions, in a ring
-    # [Q, 4, 2] float32 texture coordinates of the corners: (0, 0) is the outer corner of the first texel of the page,
-    # (1, 1) that of the last one, as in glTF
-    uv: Tensor
-    page: Tensor  # [Q] int64, page of the quad's texels
+    uv: Tensor  # [Q, 4, 2] float32 texture coordinates of the corners, as in glTF
+    page: Tensor  # [Q] int64
     pages: Tensor  # [P, height, width, 4] uint8 RGBA, with alpha cutoff `MASK`
 
     def __len__(self) -> int:
@@ -44,10 +42,10 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
     """Convert the surfels of a scene on the CPU, with its texels decoded, to quads.
 
     A quad is the square around the disc in which the surfel's opacity o k = o (1 - r^2 / R^2)^beta is at least `level`,
-    in (0, 1). Its alpha is 1 - r^2 / (2 radius^2), which is 0.5 at the rim of the disc. With alpha texels m the opacity
-    is o k m: the disc is that of the largest m, and alpha is at most o k m / (2 level). A surfel below the level
-    everywhere has no quad. Colours are max(color + residual, 0), with `color` [N, 3]. Texels are resampled from the
-    surfel's tile, at about its resolution, with the outer texel centres at the corners."""
+    in (0, 1); below it everywhere there is none. Alpha is 1 - r^2 / (2 radius^2), 0.5 at the rim of the disc. With
+    alpha texels m the opacity is o k m: the disc is that of the largest m, and alpha is at most o k m / (2 level).
+    Colours are max(color + residual, 0), with `color` [N, 3]. Texels are resampled from the surfel's tile, at about its
+    resolution, with the outer texel centres at the corners."""
     surfels = scene.surfels
     opacity = torch.sigmoid(surfels["opacity_logits"].double()) * _largest_alpha(scene)
     kept = torch.nonzero(opacity > level).squeeze(1)
@@ -74,8 +72,7 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
 
 def fetch_texels(scene: BakedScene, tiles: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """Fetch texels of tiles [n, 5] int64 bilinearly, clamped to their outer texel centres, on the CPU: [n, r_v, r_u, 4]
-    residual colour and alpha, 0 without alpha texels. `u`, `v`: [n, r_u], [n, r_v] in half sides of the tiles, from -1
-    to 1 inside."""
+    residual colour and alpha, 0 without alpha texels. `u`, `v`: [n, r_u], [n, r_v] in half sides of the tiles."""
     assert scene.atlas is not None
     _, height, width, _ = scene.atlas.shape
     (low_u, high_u, fu), (low_v, high_v, fv) = (
@@ -103,7 +100,7 @@ def bilinear(
 
 
 def _between(at: Tensor, count: Tensor, first: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Compute the texels on both sides of positions [n, r] in [-1, 1] along an axis, and the interpolation weights."""
+    """Compute the texels around positions [n, r] in [-1, 1] along an axis, and the weights of the later ones."""
     last = (count - 1)[:, None]
     x = ((0.5 * (at + 1.0)) * count[:, None] - 0.5).clamp(min=0.0)
     x = torch.minimum(x, last.to(x))

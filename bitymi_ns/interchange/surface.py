@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 HALF = 0.5  # accumulated weight at which the median depth is reached
 TRUNCATION = 8.0  # truncation distance of the TSDF in voxels; with 4, walls with noisy depth get more holes
-SMOOTHING = 10  # iterations of Taubin smoothing, which removes the noise of depths and preserves volumes
+SMOOTHING = 10  # iterations of Taubin smoothing
 QUANTILE = 0.01  # share of the observed points outside each side of the box
 REACH = 3.0
 """Maximum half side of the box, relative to the larger of the cameras' extent and the median depth of all views."""
@@ -47,20 +47,19 @@ class SurfaceOptions:
     """Options of surface extraction."""
 
     resolution: Annotated[int, Field(ge=16, le=4096)] = 256
-    """Voxels along the longest side of the observed box, 16 to 4096. Time and memory grow with its square."""
+    """Voxels along the longest side of the observed box. Time and memory grow with its square."""
     triangles: Annotated[int, Field(ge=0, le=10**8)] = 500_000
     """Maximum number of triangles, reached by simplification (quadric error metrics); 0 = no limit."""
     watertight: bool = False
-    """Close the mesh, for 3D printing, by Poisson reconstruction; open or self-touching parts are cut and filled.
-    Invents surface in unobserved regions."""
+    """Close the mesh, for 3D printing, by Poisson reconstruction, which invents surface in unobserved regions; open or
+    self-touching parts are cut and filled."""
 
 
 @torch.no_grad()
 def median_depth(surfels: Mapping[str, Tensor], camera: Camera, near: float, alpha: TexelAlpha | None = None) -> Tensor:
     """Compute the median depth [H, W], camera z of the fragment at which the accumulated blending weight reaches 0.5; 0
-    if none does. `surfels`: geometry by name (`GEOMETRY`). `near`: near plane, camera z. `alpha`: opacities of the
-    surfels' texels; None: opaque texels. Raises TooManyFragments: a single row of screen tiles has more fragments than
-    memory holds."""
+    if none does. `surfels`: geometry by name (`GEOMETRY`). `near`: near plane, camera z. `alpha`: opacities of texels;
+    None: opaque. Raises TooManyFragments: a row of screen tiles has more fragments than memory holds."""
     projection = project(*geometry_of(surfels), camera=camera, near=near, alpha=alpha)
     rows = []
     for fragments in fitting_lists(projection):
@@ -79,8 +78,7 @@ def median_depth(surfels: Mapping[str, Tensor], camera: Camera, near: float, alp
 
 def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
     """Compute the box [2, 3] around the points of depth maps, without the outermost `QUANTILE` at each side, within
-    `REACH` times the larger of the cameras' extent and the median depth. Raises NoSurface: there are no cameras, or no
-    pixel has a depth."""
+    `REACH` (above). Raises NoSurface: there are no cameras, or no pixel has a depth."""
     if not cameras:
         raise NoSurface("there are no cameras that see the surface")
     points = torch.cat([_points(depth, camera) for depth, camera in zip(depths, cameras, strict=True)])
@@ -113,9 +111,8 @@ def extract_surface(
     to: Similarity | None = None,
 ) -> Triangles:
     """Fuse the median depths of views into a triangle mesh with vertex colors. `surfels`, `near`, `alpha`: as in
-    `median_depth`. `render`: renders the colors [H, W, 3] of a view, for the vertices. `to`: transform to the mesh's
-    frame; None: the scene's frame. Raises NoSurface: there is nothing to fuse. Raises ValueError: an option is out of
-    range."""
+    `median_depth`. `render`: renders the colors [H, W, 3] of a view. `to`: transform to the mesh's frame; None: the
+    scene's. Raises NoSurface: there is nothing to fuse. Raises ValueError: an option is out of range."""
     import open3d
 
     options = options or SurfaceOptions()
@@ -162,8 +159,8 @@ def _integrate(volume: open3d.t.geometry.VoxelBlockGrid, camera: Camera, depth: 
     K, viewmat = camera.K.cpu().double(), camera.viewmat.cpu().double()
     K[:2, 2] -= 0.5  # open3d samples pixels at integer coordinates, this package at + 0.5
     K, viewmat = open3d.core.Tensor(K.numpy()), open3d.core.Tensor(viewmat.numpy())
-    maps = (np.ascontiguousarray(each.float().numpy()) for each in (depth, rgb.clamp(0.0, 1.0).cpu()))
-    depth, rgb = (open3d.t.geometry.Image(open3d.core.Tensor(each)) for each in maps)
+    maps = (np.ascontiguousarray(image.float().numpy()) for image in (depth, rgb.clamp(0.0, 1.0).cpu()))
+    depth, rgb = (open3d.t.geometry.Image(open3d.core.Tensor(image)) for image in maps)
     limits = (1.0, math.inf, TRUNCATION)  # the depth's unit, and the farthest
     blocks = volume.compute_unique_block_coordinates(depth, K, viewmat, *limits)
     volume.integrate(blocks, depth, rgb, K, K, viewmat, *limits)

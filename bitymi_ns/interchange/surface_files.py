@@ -15,8 +15,8 @@ MeshFormat = Literal["ply", "glb", "obj"]
 
 
 def mesh_bytes(mesh: Triangles, form: MeshFormat, up: Tensor, origin: Tensor, note: str = "") -> bytes:
-    """Encode a mesh with vertex colors and normals. PLY and OBJ keep its axes and have the note on the origin, one line
-    or empty, as a comment; glTF has +y up and the origin in its node. `up`, `origin`: [3]."""
+    """Encode a mesh with vertex colors and normals. PLY and OBJ keep its axes and have `note`, one line or empty, as a
+    comment; glTF has +y up and the origin in its node. `up`, `origin`: [3]."""
     normals = _normals(mesh)
     if form == "glb":
         return surface_glb(mesh, normals, upright(up, origin))

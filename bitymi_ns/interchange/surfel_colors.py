@@ -1,4 +1,4 @@
-"""Surfel colours for other programs: spherical harmonics, one mean colour, one mean residual."""
+"""Surfel colours for other programs: spherical harmonics, mean colour, mean residual."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class SurfelColors:
 
 
 def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Select surfels by row. The terms of reduced view colours are all kept, as `view_span` indexes them."""
+    """Select surfels by row, with all terms of reduced view colours."""
     return {name: value if name == "view_terms" else value[rows] for name, value in surfels.items()}
 
 
@@ -38,11 +38,10 @@ def rows_of(surfels: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 def fit_colors(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers: Tensor) -> SurfelColors:
     """Fit spherical harmonics to the colours of surfels, by least squares over directions.
 
-    The colour is max(max(f_view(d) + 0.5, 0) + residual, 0). Directions are those of `bake.directions` (of all training
-    views that show the surfel, and 32 between and around them), with a total weight of 1, and OUTSIDE directions over
-    the whole sphere with a total weight of OUTSIDE_WEIGHT, which regularise the fit elsewhere. A surfel that no view
-    shows has directions over the sphere only. `scene`: N surfels on the CPU. `residual`: [N, 3]; None: no residual.
-    `seen`: [V, N] bool; V may be 0. `centers`: [V, 3] float64 camera centres, the scene's frame."""
+    The colour is max(max(f_view(d) + 0.5, 0) + residual, 0). Directions are those of `bake.directions`, with a total
+    weight of 1, and OUTSIDE directions over the whole sphere with a total weight of OUTSIDE_WEIGHT. A surfel that no
+    view shows has directions over the sphere only. `scene`: N surfels on the CPU. `residual`: [N, 3]; None: 0. `seen`:
+    [V, N] bool; V may be 0. `centers`: [V, 3] float64 camera centres, the scene's frame."""
     surfels = scene.surfels
     means = surfels["means"]
     found = SurfelColors(means.new_zeros(len(means), harmonics.TERMS, 3), means.new_zeros(len(means), 3))
@@ -72,8 +71,8 @@ def weighted_fit(directions: Tensor, values: Tensor, weight: Tensor) -> Tensor:
 
 @torch.no_grad()
 def weighted_residuals(scene: BakedScene, chunk: int = 1 << 20) -> Tensor | None:
-    """Average the residual of each surfel over its texels, weighted by kernel times alpha: [N, 3]. Without a tile it is
-    the surfel's `mean_residual`. None: the scene has no residual."""
+    """Average the residual of each surfel over its texels, weighted by kernel times alpha: [N, 3]; without a tile, its
+    `mean_residual`. None: the scene has no residual."""
     if scene.mean_residual is None and scene.atlas is None:
         return None
     means = scene.surfels["means"]

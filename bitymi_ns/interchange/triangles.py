@@ -1,4 +1,4 @@
-"""Triangle meshes in float32: removal of degenerate triangles, and closing of holes."""
+"""Triangle meshes: removal of degenerate triangles, closing of holes."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 FLAT = 1e-6  # height over longest side below which a triangle is degenerate, the precision of float32
 _ROUNDS = 20  # of collapsing degenerate triangles: each may create others
-_ATTEMPTS = 4  # rounds of cleaning and closing; each leaves the mesh closed, but may leave degenerate triangles
+_ATTEMPTS = 4  # rounds of cleaning and closing, which may leave degenerate triangles
 
 
 @dataclass(frozen=True)
@@ -78,8 +78,8 @@ def cleaned(mesh: Triangles) -> Triangles:
 
 
 def closed(mesh: Triangles) -> Triangles:
-    """Close a mesh. Removes the triangles at edges of more than two triangles, and all but the largest fan at vertices
-    of several fans; the remaining holes are simple rings, and each is filled with a fan around its centre."""
+    """Close a mesh: remove the triangles at edges of more than two triangles, and all but the largest fan at vertices
+    of several, then fill the remaining holes, simple rings, with a fan around their centre."""
     while len(mesh):
         _, index, count = np.unique(_keys(mesh.faces)[0], return_inverse=True, return_counts=True)
         keep = (count[index] == 1).reshape(3, -1).all(0)
@@ -111,7 +111,7 @@ def closed(mesh: Triangles) -> Triangles:
 
 def solid(mesh: Triangles, smallest: float) -> Triangles:
     """Clean and close a mesh, orient its triangles outwards, and remove components of less than a share `smallest` of
-    the triangles of the largest one; `open_edges` counts what could not be closed."""
+    the largest one's triangles."""
     for _ in range(_ATTEMPTS):
         mesh = closed(cleaned(mesh).without_specks(smallest)).without_specks(smallest)  # also specks cut off by closing
         if len(cleaned(mesh)) == len(mesh):
@@ -120,12 +120,12 @@ def solid(mesh: Triangles, smallest: float) -> Triangles:
 
 
 def _directed(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """List start and end vertices [3F] of the edges: the first edges of all triangles, then the second, the third."""
+    """List start and end vertices [3F] of the edges: all triangles' first edges, then the second, the third."""
     return faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel()
 
 
 def _keys(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Compute a key [3F] of each edge, in the order of `_directed`, and the key of the reversed edge."""
+    """Compute a key [3F] of each edge, in the order of `_directed`, and of the reversed edge."""
     start, end = _directed(faces)
     return start << 32 | end, end << 32 | start
 

@@ -13,7 +13,7 @@ from .gaussians import Gaussians
 
 
 def check_usd() -> None:
-    """Check that OpenUSD can be imported and has surflets. Raises BundleError: it cannot, or is too old."""
+    """Raise BundleError if OpenUSD cannot be imported or is too old for surflets."""
     try:
         from pxr import UsdVol
 
@@ -26,10 +26,9 @@ def write_usd(path: str | Path, gaussians: Gaussians, place: np.ndarray) -> None
     """Write a binary USD file, .usdc, with a ParticleField prim per kernel.
 
     A surflet is a disc in its xy plane with kernel exp(-r^2 / 2) (GaussianSurfletAPI), or 1 up to r = 1
-    (ConstantSurfletAPI), and its own scales, orientation, position and opacity. Spherical harmonics have degree 3, the
-    basis and offset of 3DGS, and give sRGB colors, as the attribute's color space states. Third scales are omitted,
-    discs (`Gaussians.hard`) get twice the scales. `place`: transform [4, 4] of the root, from the Gaussians' frame to
-    one with +y up; its unit is taken as a metre."""
+    (ConstantSurfletAPI). Spherical harmonics have degree 3, the basis and offset of 3DGS, and give sRGB colors. Third
+    scales are omitted, discs (`Gaussians.hard`) get twice the scales. `place`: transform [4, 4] of the root to a frame
+    with +y up; its unit is taken as a metre."""
     from pxr import Gf, Sdf, Usd, UsdGeom, UsdVol, Vt
 
     stage = Usd.Stage.CreateNew(str(path))

@@ -34,8 +34,8 @@ def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
 
 
 def coarser(atlas: Tensor, tiles: Tensor, alpha: bool) -> dict[str, Any]:
-    """Compute the coarser levels of an atlas, with or without alpha, gathered for the kernel, by name."""
-    return {name: gather(pages, of) for name, pages, of in tile_levels(atlas, tiles, alpha)}
+    """Gather the coarser levels of an atlas for the kernel, by name."""
+    return {name: gather(pages, placed) for name, pages, placed in tile_levels(atlas, tiles, alpha)}
 
 
 def frame(

@@ -24,8 +24,7 @@ def draws_blocks(device: torch.device) -> bool:
 
 
 def decoded(blocks: Tensor) -> Tensor:
-    """Decode BC7 blocks [layers, height / 4, width / 4, 16] uint8 to texels [layers, height, width, 4] uint8 on the
-    CPU."""
+    """Decode BC7 blocks [layers, height / 4, width / 4, 16] uint8 to texels [layers, height, width, 4] on the CPU."""
     height, width = 4 * blocks.shape[1], 4 * blocks.shape[2]
     pages = [decode_bc7(bytes(page.contiguous().numpy()), width, height) for page in blocks.cpu()]
     return torch.from_numpy(np.stack(pages))
@@ -47,8 +46,8 @@ class Sheet(NamedTuple):
         return cls(max(1, min(pages, 2**14 // height)), width, height)
 
     def joined(self, pages: Tensor, side: int) -> Tensor:
-        """Join pages [pages, rows, columns, channels] of texels, or of blocks with `side` texels along a side, to one
-        [rows, columns, channels]."""
+        """Join pages [pages, rows, columns, channels] of texels, or of blocks of `side` texels, to one [rows, columns,
+        channels]."""
         height, width = self.height // side, self.width // side
         count, rows, columns, channels = pages.shape
         beside = max(1, -(-count // self.down))
@@ -85,8 +84,7 @@ class AtlasTexture:
             )
 
     def halved(self, alpha: bool) -> AtlasTexture:
-        """Return a texture of half the sides, averaging 2 x 2 texels like `baked_scene.halved`; computed on the device,
-        which decodes BC7 while sampling."""
+        """Return a texture of half the sides, averaging 2 x 2 texels on the device like `baked_scene.halved`."""
         height, width = (side // 2 for side in self.size)
         dtype = torch.uint8 if self._bytes else torch.float32
         texels = torch.empty(height, width, 4, dtype=dtype, device=self._device)
@@ -103,9 +101,8 @@ class Atlas(NamedTuple):
 
     @classmethod
     def of(cls, pages: Tensor, blocks: bool, device: torch.device) -> Atlas:
-        """Upload pages. `pages`: [pages, height, width, 4] texels, or BC7 blocks [pages, height / 4, width / 4, 16], as
-        `AtlasTexture` takes them. `blocks`: whether they are BC7 blocks; decoded, with a warning, if the device does
-        not support them."""
+        """Upload pages [pages, height, width, 4] of texels, or [pages, height / 4, width / 4, 16] of BC7 blocks if
+        `blocks`, which are decoded, with a warning, if the device does not support them."""
         pages = pages.detach().cpu()
         if blocks and not draws_blocks(device):
             pages, blocks = decoded(pages), False
@@ -119,7 +116,7 @@ class Atlas(NamedTuple):
         return cls(sheet, AtlasTexture(sheet.joined(pages, side), blocks, device))
 
     def levels(self, alpha: bool) -> dict[str, AtlasTexture]:
-        """Compute the coarser levels of the tiles, with or without alpha, by name (`tile_levels`)."""
+        """Compute the coarser levels of the tiles by name (`tile_levels`)."""
         half = self.texture.halved(alpha)
         return dict(zip(LEVELS, (half, half.halved(alpha)), strict=True))
 

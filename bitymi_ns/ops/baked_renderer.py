@@ -50,8 +50,8 @@ class Workspace:
         self.memory: Tensor | None = None
 
     def resize(self, surfels: int, views: int, width: int, height: int, normals: bool, capacity: int = 0) -> None:
-        """Allocate for such frames with at least `capacity` pairs, or as
-        many as before. Raises ValueError: more surfels, views or pairs than a frame can have; states the numbers."""
+        """Allocate for such frames with at least `capacity` pairs, or as many as before. Raises ValueError: more
+        surfels, views or pairs than a frame can have."""
         kernels, device = module(self._device), self._device
         most = kernels.MOST_PAIRS
         if capacity > most:
@@ -187,8 +187,7 @@ class BakedRenderer:
         return self._surfels == 0 or self.workspace.counts()[1] <= self.workspace.capacity
 
     def _draw(self, stages: Stage) -> None:
-        """Start a frame without allocating or waiting, so that it can be recorded. Surfels are missing if their pairs
-        do not fit into the workspace."""
+        """Start a frame without allocating or waiting, so that it can be recorded."""
         _, width, height = self._size
         function("baked_frame", self._device)(
             **self.images,

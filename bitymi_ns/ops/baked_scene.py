@@ -42,7 +42,7 @@ class DrawCache:
         return DrawCache, ()
 
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
-        """Return the atlas, made for the first frame and whenever a source was replaced or written to."""
+        """Return the atlas, made anew when a source was replaced or written to."""
         now = [(t, version_of(t) if isinstance(t, Tensor) else 0) for t in sources]
         with self._lock:
             if len(now) != len(self._sources) or any(
@@ -53,8 +53,7 @@ class DrawCache:
             return self._atlas
 
     def coarser(self, make: Callable[[], Any]) -> Any:
-        """Return the coarser levels of the latest `atlas`, made for the first frame that is smaller than the
-        photographs."""
+        """Return the coarser levels of the latest `atlas`, made for the first frame that needs them."""
         with self._lock:
             if self._coarser is None:
                 self._coarser = make()
@@ -127,8 +126,7 @@ LEVELS = ("half", "quarter")  # names of the levels, by their side relative to t
 
 def halved(atlas: Tensor, alpha: bool = False) -> Tensor:
     """Average 2 x 2 texels: [layers, height, width, 4] to [layers, height / 2, width / 2, 4], bytes rounded, an odd row
-    or column dropped. With `alpha`, colours are weighted by the fourth channel unless all four are 0: transparent
-    texels do not tint their neighbours."""
+    or column dropped. With `alpha` as `alpha_means`: transparent texels do not tint their neighbours."""
     height, width = atlas.shape[1] // 2 * 2, atlas.shape[2] // 2 * 2
     # stacked, as torch reduces the outermost dimension several times as fast as inner ones
     four = torch.stack([atlas[:, i:height:2, j:width:2] for i in (0, 1) for j in (0, 1)])
@@ -162,8 +160,8 @@ def tile_levels(atlas: Tensor, tiles: Tensor, alpha: bool = False) -> Iterator[t
         alpha: as in `halved`.
 
     Yields:
-        name, pages, and the tiles on them; r_u = 0 for a tile without such a level, because its corner or sides are off
-        the grid of the level. Tiles of bundles lie on a grid of four texels, so they have both levels.
+        name, pages, and the tiles on them; r_u = 0 for a tile whose corner or sides are off the level's grid. Tiles of
+        bundles, on a grid of four texels, have both levels.
     """
     scaled = tiles.new_tensor([1, 1, 0, 1, 1])
     for level, name in enumerate(LEVELS, start=1):

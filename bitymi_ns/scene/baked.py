@@ -17,8 +17,6 @@ from .camera import Camera
 from .sampling import TWO_SAMPLES, Sampling, averaged, padded, part_of, sampling_of, size_of
 
 FAST = 1 / 512  # transmittance at which fast rendering ends a pixel: at most half an 8-bit step is lost
-
-
 OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")  # fields of a `BakedOutput`
 
 
@@ -52,10 +50,9 @@ class BakedScene:
         surfels: per-surfel parameters by name (docs/overview.md), float32.
         view_color: a name of `ops.VIEW_COLORS`.
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
-        atlas: [layers, height, width, 4] uint8 or float32 on the CPU; None: no residual. Float texels are rendered as
-            float16 on a CUDA device.
+        atlas: [layers, height, width, 4] uint8 or float32 (on a CUDA device float16) on the CPU; None: no residual.
         blocks: [layers, height / 4, width / 4, 16] uint8 on the CPU, the same atlas as BC7 blocks, which a CUDA device
-            reads directly; None: not given. The CPU needs `atlas`.
+            reads; None: not given. The CPU needs `atlas`.
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
         extent: [N] half side of the tile in scale units; None: 3 everywhere, the kernel's support.
         mean_residual: [N, 3] float32 mean residual of each tile, and the residual of surfels without a tile. None: 0.
@@ -65,8 +62,7 @@ class BakedScene:
         near: near plane, camera z.
         weight_bound: fragments of smaller blending weight have no residual.
         transmittance_min: a pixel ends at the surfel, not blended itself, that would leave less transmittance; 0: no
-            limit. Training uses 1e-4; `FAST` is faster and changes a pixel by at most half an 8-bit step. WebGPU always
-            uses 1e-4.
+            limit. Training uses 1e-4, and WebGPU always.
         photographed: [P, 4] float32 on the CPU, points of the scene and their resolution in the photographs, pixels per
             world unit, to choose the sampling of a view (`sampling.py`); None: as at the photographs' scale.
         through_webgpu: render through WebGPU (`ops.webgpu`) on any device; images are then on the CPU.
@@ -91,13 +87,13 @@ class BakedScene:
     cache: DrawCache = field(default_factory=DrawCache, init=False, repr=False, compare=False)
 
     def residuals(self) -> Tensor:
-        """Compute the residual colours of the atlas, [layers, height, width, 3] float32. Raises ValueError: there is no
-        atlas, or only its BC7 blocks."""
+        """Compute the residual colours of the atlas, [layers, height, width, 3] float32. Raises ValueError: there is
+        none, or only its BC7 blocks."""
         return self._values(slice(3)) * self.scale + self.offset
 
     def alphas(self) -> Tensor | None:
-        """Compute the atlas's factors m of sigma, [layers, height, width] float32; None if there is no atlas or its
-        texels are opaque. Raises ValueError: there are only the atlas's BC7 blocks."""
+        """Compute the atlas's factors m of sigma, [layers, height, width] float32; None: no atlas, or opaque texels.
+        Raises ValueError: there are only the atlas's BC7 blocks."""
         if not self.alpha_scale or (self.atlas is None and self.blocks is None):
             return None
         return self._values(3) * self.alpha_scale
@@ -133,7 +129,7 @@ class BakedScene:
         """Render a view. Texels are fetched bilinearly, clamped to the tile's outer texel centres. Samples per pixel
         follow the scale of the view (`sampling`); overdraw is the sum over the samples of a pixel.
 
-        On a CUDA device this allocates its images and synchronises; `baked_renderer` keeps memory and CUDA graphs.
+        On a CUDA device this allocates its images and synchronises; `SceneRenderer` keeps memory and CUDA graphs.
 
         Args:
             background: [3] colour behind the scene; None: black.

@@ -28,15 +28,14 @@ class Camera:
 
     def __post_init__(self) -> None:
         if tuple(self.viewmat.shape) != (4, 4) or tuple(self.K.shape) != (3, 3):
-            raise ValueError(
-                f"a camera needs viewmat [4, 4] and K [3, 3], not {tuple(self.viewmat.shape)} and {tuple(self.K.shape)}"
-            )
+            shapes = f"{tuple(self.viewmat.shape)} and {tuple(self.K.shape)}"
+            raise ValueError(f"a camera needs viewmat [4, 4] and K [3, 3], not {shapes}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"a camera needs a positive image size, not {self.width} x {self.height}")
 
     @cached_property
     def exact_center(self) -> Tensor:
-        """Camera centre in the world frame, [3] float64: float32 is too coarse far from the origin. Cached."""
+        """Camera centre in the world frame, [3] float64: float32 is too coarse far from the origin."""
         with torch.inference_mode(False):  # an inference tensor could not enter an autograd graph later
             viewmat = self.viewmat.double()
             # no matrix product: cuBLAS fails if torch is set to deterministic algorithms
@@ -53,9 +52,9 @@ class Camera:
         return float(self.K[0, 1]) != 0.0
 
     def _with(self, **changes: Any) -> Camera:
-        skewed, other = self.skewed, replace(self, **changes)
-        other.__dict__["skewed"] = skewed
-        return other
+        skewed, camera = self.skewed, replace(self, **changes)
+        camera.__dict__["skewed"] = skewed
+        return camera
 
     def to(self, device: torch.device | str) -> Camera:
         """Move the camera to a device; copies from the CPU are asynchronous."""
@@ -77,8 +76,7 @@ class Camera:
 
     def project(self, points: Tensor, near: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Project world points [M, 3] to pixel coordinates x, y and camera z, each [M], and test if they are inside the
-        image, [M] bool. `near`: near plane; z is clamped to it for x and y, and points nearer than it are not
-        inside."""
+        image and beyond the plane z = `near`, [M] bool; x and y are those of z clamped to it."""
         x, y, z = self.local(points).unbind(-1)
         depth, K = z.clamp(min=near), self.K.to(points.dtype)
         x, y = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]

@@ -18,7 +18,6 @@ def _tensor(numbers: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
 
 
 def vector(numbers: Sequence[float]) -> Vector:
-    """Make a vector of three numbers."""
     x, y, z = numbers
     return x, y, z
 
@@ -33,12 +32,11 @@ class Box:
 
     @classmethod
     def rotated(cls, center: Sequence[float], half: Sequence[float], quat: Sequence[float]) -> Box:
-        """Make a box whose axes are those of a rotation wxyz, of any length but zero."""
+        """Make a box with the axes of a rotation wxyz, of any length but zero."""
         return cls.of(center, half, rotation(_tensor([quat]))[0].tolist())
 
     @classmethod
     def of(cls, center: Sequence[float], half: Sequence[float], axes: Sequence[Sequence[float]]) -> Box:
-        """Make a box of numbers in any sequences."""
         x, y, z = map(vector, axes)
         return cls(vector(center), vector(half), (x, y, z))
 

@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 def _current(cached: tuple[Tensor, int, T] | None, buffer: Tensor) -> T | None:
-    """Return a cached value if it belongs to a buffer in its current version."""
+    """Return a cached value if it is of a buffer's current version."""
     return cached[2] if cached is not None and cached[0] is buffer and cached[1] == version_of(buffer) else None
 
 
@@ -78,8 +78,8 @@ class HashField(nn.Module):
         return self.field_table, self.field_w1, self.field_w2, self.field_w3
 
     def residual(self, fragments: Fragments, frames: Tensor, bound: float, learns: bool) -> Tensor:
-        """Compute the residual colours [F, 3] of a view's fragments, with or without gradients. `frames`: [N, 9] of its
-        `Projection`. `bound`: fragments of smaller weight have none."""
+        """Compute the residual colours [F, 3] of a view's fragments, with gradients if `learns`. `frames`: [N, 9] of
+        its `Projection`. `bound`: fragments of smaller weight have none."""
         weights = self.weights if learns else tuple(w.detach() for w in self.weights)
         return fragment_residual(fragments, frames, self.geometry, weights, bound, learns and self._moves_surfels)
 
@@ -88,10 +88,9 @@ class HashField(nn.Module):
         return field(x, self.geometry, *self.weights)
 
     def voxel_size(self, x: Tensor) -> Tensor:
-        """Compute the edges of the finest voxel at world positions.
+        """Compute the radial and tangential edge, [M, 2] world units, of the finest voxel at world positions [M, 3].
 
-        Outside the unit ball the contraction stretches a voxel by r^2 radially and by r / (2 - 1/r) tangentially. `x`:
-        [M, 3] world positions. Returns [M, 2] radial and tangential edge, world units."""
+        Outside the unit ball the contraction stretches a voxel by r^2 radially and by r / (2 - 1/r) tangentially."""
         g = self.geometry
         finest = g.min_resolution << (self.levels - 1)
         if not g.contract:
@@ -165,8 +164,7 @@ class TexelField(nn.Module):
         """Return the arguments of `blended_image`.
 
         Args:
-            bound: fragments of smaller weight have no residual.
-            learns: compute gradients.
+            bound, learns: as in `opacity`.
             descent: update of the texels by the backward pass; None: they get a gradient.
             read: copy of the texels before the backward pass, for a view rendered in bands.
         """
@@ -177,7 +175,7 @@ class TexelField(nn.Module):
         return {"texels": texels, "tiles": self.tiles, "bound": bound, "move_surfels": learns, "descent": descent}
 
     def opacity(self, bound: float, learns: bool) -> TexelAlpha | None:
-        """Return opacities of texels, with or without gradients, see `ops.TexelAlpha`; None: opaque texels."""
+        """Return opacities of texels, with gradients if `learns`; None: opaque texels."""
         if self.alpha is None:
             return None
         return TexelAlpha(self.tiles, self.alpha if learns else self.alpha.detach(), bound)

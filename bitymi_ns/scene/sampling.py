@@ -18,9 +18,8 @@ SMALLEST, LARGEST = 0.5, 2.0
 ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
 """Smallest scales with one sample per pixel, and with two along each axis."""
 SAMPLE = 0.58
-"""Minimum number of samples across a photograph's pixel at smaller scales, within the limits below. Coarser samples
-blur edges that the alpha texels of several surfels share: the mean transmittance of a stack is not the product of the
-means."""
+"""Minimum number of samples across a photograph's pixel at smaller scales, within the limits below. Coarser ones blur
+edges that the alpha texels of several surfels share: the mean transmittance of a stack is not the product of means."""
 MOST_SAMPLES, FEW_PIXELS = 6, 1 << 21  # maximum per pixel along each axis; more up to this number of samples in all
 MOST_PIXELS = 1 << 24  # maximum number of samples of a view
 FARTHEST = (1.0 / 64, 64.0)  # range of scales
@@ -45,9 +44,8 @@ class Sampling:
 
 
 def size_of(photographed: Tensor, camera: Camera) -> float:
-    """Measure the scale of a view relative to the photographs: 1 = same size, 0.5 = half their size. `photographed`:
-    [P, 4] points of the scene with the pixels per unit of length of their photographs. Returns median over the points
-    inside the image; 1 without such points."""
+    """Measure the scale of a view relative to the photographs, 0.5 = half their size: the median over the points of
+    `photographed` (`BakedScene`) inside the image; 1 without any."""
     # NumPy: for a few thousand points per frame, torch's overhead would dominate
     viewmat, K, points = (t.detach().cpu().double().numpy() for t in (camera.viewmat, camera.K, photographed))
     x, y, z = (points[:, :3] @ viewmat[:3, :3].T + viewmat[:3, 3]).T
@@ -62,15 +60,8 @@ def size_of(photographed: Tensor, camera: Camera) -> float:
 
 
 def part_of(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], near: float) -> Part:
-    """Bound the part of views of one size in which surfels can be seen, by spheres around their discs.
-
-    Args:
-        surfels: means [N, 3] and log_scales [N, 2], on the device of the cameras.
-        near: nearest rendered depth of a centre.
-
-    Returns:
-        one part for all views, at least one pixel.
-    """
+    """Bound the part of views of one size, at least a pixel, in which surfels can be seen, by spheres around their
+    discs. `surfels`: means [N, 3] and log_scales [N, 2], on the cameras' device. `near`: nearest depth of a centre."""
     reach = SUPPORT * surfels["log_scales"].amax(1).exp()
     bounds = []
     for camera in cameras:
@@ -123,7 +114,7 @@ def averaged(images: dict[str, Tensor], samples: int) -> dict[str, Tensor]:
 
 def padded(image: Tensor, part: Part, size: tuple[int, int], around: Tensor | None = None) -> Tensor:
     """Pad images [views, rows, columns, channels] of a part of views to whole views of `size`, height and width, with
-    the value `around` [channels]; None: 0."""
+    `around` [channels]; None: 0."""
     left, top, right, bottom = part
     whole = image.new_zeros(len(image), *size, image.shape[-1])
     if around is not None:

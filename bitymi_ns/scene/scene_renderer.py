@@ -14,12 +14,7 @@ from .sampling import Sampling
 
 class SceneRenderer:
     """Renderer for any camera and device. On a CUDA device each repeated image size gets its own `BakedRenderer`, on a
-    GPU with a CUDA graph. Thread-safe.
-
-    Args:
-        scene: on the device to render on.
-        kept: maximum number of `BakedRenderer`, each with its own working memory; the oldest is dropped first.
-    """
+    GPU with a CUDA graph; at most `kept` of them, the oldest is dropped first. Thread-safe."""
 
     def __init__(self, scene: BakedScene, kept: int = 4) -> None:
         self.scene, self._kept = scene, kept
@@ -33,7 +28,7 @@ class SceneRenderer:
 
     @torch.no_grad()
     def render(self, camera: Camera, background: Tensor | None = None, maps: bool = False) -> BakedOutput:
-        """Render a view; arguments and images as in `BakedScene.render`."""
+        """Render a view as `BakedScene.render`."""
         scene, device = self.scene, self.scene.tiles.device
         # a graph fixes the sampling: views of another scale are rendered without one
         if scene.through_webgpu or not cuda_backend(device) or scene.sampling([camera]) != Sampling():

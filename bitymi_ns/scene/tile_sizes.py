@@ -10,7 +10,6 @@ from .camera import Camera
 
 MARGIN = 1.5
 """Factor of the transmittance in front of a surfel: held-out views may see more of it than training views."""
-
 _ROUNDING = 1e-6  # relative tolerance: a rounded power of two must not double the tile
 
 
@@ -23,21 +22,19 @@ def next_power_of_two(x: Tensor) -> Tensor:
 
 
 def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor | None = None) -> Tensor:
-    """Compute the edge of the finest voxel along each tangent axis of a surfel, the local delta of the Nyquist rule.
+    """Compute the edge of the finest voxel along each tangent axis of a surfel, [N, 2], world units: the local delta of
+    the Nyquist rule.
 
-    Outside the unit ball of a contracted scene, voxels are elongated along the ray from the centre. Let cos be the
-    component of the axis t along that ray: a unit step along t crosses cos / radial voxels along the ray and
-    sin / tangential voxels across it, and the edge along t is 1 over the root of the sum of their squares. Without a
-    centre both axes use the smaller edge, which never samples too coarsely.
+    Outside the unit ball of a contracted scene, voxels are elongated along the ray from the centre. With cos the
+    component of an axis along that ray, a unit step crosses cos / radial voxels along the ray and sin / tangential
+    ones across it; the edge is 1 over the root of the sum of their squares. Without a centre both axes use the smaller
+    edge.
 
     Args:
         voxel: [N, 2] (radial, tangential) voxel edges at the surfels' centres, world units.
         axes: [N, 3, 2] unit tangent directions, world frame.
         means: [N, 3] surfel centres, world frame.
         center: [3] centre of the contraction, world frame.
-
-    Returns:
-        [N, 2] voxel edges along u and v, world units.
     """
     if center is None:
         return voxel.amin(dim=1, keepdim=True).expand(-1, 2)
@@ -48,8 +45,7 @@ def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor 
 
 
 def check_sides(r_min: int, r_max: int) -> None:
-    """Check the limits of tile sides. Raises ValueError: a limit is no power of two >= 4, or `r_min` is larger than
-    `r_max`."""
+    """Raise ValueError if a limit of tile sides is no power of two >= 4, or `r_min` is larger than `r_max`."""
     for name, value in (("r_min", r_min), ("r_max", r_max)):
         if value < 4 or value & (value - 1):
             raise ValueError(f"{name} must be a power of two of at least 4 (a BC7 block is 4 x 4 texels), not {value}")
@@ -65,20 +61,17 @@ def nyquist_resolution(
     r_max: int = 64,
     max_pixels: Tensor | None = None,
 ) -> Tensor:
-    """Compute tile resolutions at the Nyquist rate of the finest hash level, capped by the training views' resolution.
+    """Compute tile resolutions at the Nyquist rate of the finest hash level, [N, 2] int32 (r_u, r_v), powers of two.
 
-    Paper, eq. (nyquist): r_a = clamp(2^ceil(log2(4 e s_a / delta)), r_min, r_max); then r_a is at most the next power
-    of two of the largest projected extent in pixels.
+    Paper, eq. (nyquist): r_a = clamp(2^ceil(log2(4 e s_a / delta)), r_min, r_max); here r_a is also at most the next
+    power of two of the largest projected extent in pixels.
 
     Args:
         scales: [N, 2] tangent scales s, world units.
         delta: [N, 2] (or [N, 1]) finest voxel edge at the surfel along each axis, world units.
-        extent: e, half side of the tile in scale units. 3 covers the support exactly; the paper uses 4.
+        extent: e, half side of the tile in scale units; the paper uses 4.
         r_min, r_max: smallest and largest resolution, powers of two >= 4.
-        max_pixels: [N, 2] largest projected extent of the tile over the training views, pixels.
-
-    Returns:
-        [N, 2] int32 (r_u, r_v), powers of two in [r_min, r_max].
+        max_pixels: [N, 2] largest projected extent of the tile over the training views, pixels; None: no such limit.
     """
     resolution = next_power_of_two(4.0 * extent * scales / delta)  # [N, 2]
     if max_pixels is not None:
@@ -87,15 +80,15 @@ def nyquist_resolution(
 
 
 def seen_sides(pixels: Tensor, r_min: int = 4, r_max: int = 64) -> Tensor:
-    """Compute tile resolutions from the training views' resolution alone: [N, 2] int32 (r_u, r_v), powers of two in
-    [r_min, r_max], from the largest projected extents `pixels` [N, 2]. Raises ValueError: as `check_sides`."""
+    """Compute tile resolutions [N, 2] int32 (r_u, r_v), powers of two, from the largest projected extents `pixels`
+    [N, 2] alone. Raises ValueError: as `check_sides`."""
     check_sides(r_min, r_max)
     return next_power_of_two(pixels).clamp(r_min, r_max).to(torch.int32)
 
 
 def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
-    """Halve the longer of the sides [N, 2] int32 of tiles, powers of two, until they have at most `texels` [N] texels
-    each, or both sides are `r_min`."""
+    """Halve the longer of the sides [N, 2] int32 of tiles until they have at most `texels` [N] texels each, or both
+    sides are `r_min`."""
     sides = sides.clone()
     while True:
         wide = sides[:, 0] >= sides[:, 1]
@@ -109,7 +102,8 @@ def coarsened(sides: Tensor, texels: Tensor, r_min: int = 4) -> Tensor:
 def max_projected_extent(
     means: Tensor, axes: Tensor, scales: Tensor, cameras: Sequence[Camera], extent: float = SUPPORT, near: float = 0.2
 ) -> Tensor:
-    """Compute the largest projected size in pixels of each surfel's tile, per tangent axis, over the training views.
+    """Compute the largest projected size of each surfel's tile over the views, per tangent axis: [N, 2] pixels, 0 if no
+    view counts.
 
     The segment from -e s_a to +e s_a along axis a is projected with the Jacobian of the pinhole at the surfel's
     centre. A view counts if the centre lies beyond the near plane and within the image enlarged by the projected half
@@ -118,11 +112,8 @@ def max_projected_extent(
     Args:
         means, scales: [N, 3] positions and [N, 2] tangent scales, world units.
         axes: [N, 3, 2] unit tangent directions, world frame.
-        extent: half side of the tile in scale units.
+        extent: e, half side of the tile in scale units.
         near: near plane, camera z.
-
-    Returns:
-        [N, 2] float32 pixels, 0 if no view counts.
     """
     max_pixels = torch.zeros_like(scales)  # [N, 2]
     steps = axes * (2.0 * extent * scales)[:, None, :]  # [N, 3, 2] whole side of the tile
@@ -145,8 +136,8 @@ def max_projected_extent(
 
 
 def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | None = None) -> tuple[Tensor, Tensor]:
-    """Compute each surfel's largest blending weight at its centre, [N], and its kernel exponent beta, [N]. `surfels`:
-    opacity_logits [N], beta_raw [N]. `transmittance`: [N] of `Visibility`; None: no occlusion."""
+    """Compute each surfel's largest blending weight [N] and its kernel exponent beta [N]. `transmittance`: [N] of
+    `Visibility`; None: no occlusion."""
     opacity = surfels["opacity_logits"].sigmoid().clamp(max=ALPHA_MAX)
     if transmittance is not None:
         opacity = opacity * (MARGIN * transmittance).clamp(max=1.0)
@@ -155,9 +146,6 @@ def kernel_parameters(surfels: Mapping[str, Tensor], transmittance: Tensor | Non
 
 def visible_extent(opacity: Tensor, beta: Tensor, weight_bound: float) -> Tensor:
     """Compute the radius [N], in scale units, at which opacity * (1 - r^2 / 9)^beta falls to the weight bound; 0 if all
-    is below.
-
-    The low pass spreads a surfel about a pixel beyond it; there the tile's edge is read.
-    """
+    is below. The low pass spreads a surfel about a pixel beyond it, where the tile's edge is read."""
     rest = (weight_bound / opacity.clamp(min=1e-12)).clamp(max=1.0) ** (1.0 / beta.clamp(min=1e-6))
     return SUPPORT * (1.0 - rest).clamp(min=0.0).sqrt()

@@ -18,7 +18,7 @@ from .camera import Camera
 if TYPE_CHECKING:
     from .scene import Scene
 
-SAMPLE = 4096  # random surfels whose visibility is tested first: nearly all views see one of them
+SAMPLE = 4096  # random surfels that are tested first: nearly all views see one of them
 CHUNK = 1 << 20  # surfels tested at a time after that
 
 
@@ -27,8 +27,8 @@ class Visibility:
     """Visibility of N surfels in the views.
 
     Attributes:
-        transmittance: [N] float32 in [0, 1], maximum T over the surfel's blended fragments in all views (blending
-            weight = sigma T); 0 for a surfel that no view blends.
+        transmittance: [N] float32, maximum T over the surfel's blended fragments in all views (blending weight =
+            sigma T); 0 for a surfel that no view blends.
         pixels: [N] float32, maximum over the views of the sum of the surfel's blending weights that get a residual.
         squares: [V, N] bfloat16, sum over the view's pixels of the surfel's squared blending weight: a colour error e
             adds e^2 times this to the squared error.
@@ -40,7 +40,7 @@ class Visibility:
 
     @property
     def seen(self) -> Tensor:
-        """[V, N] bool, whether the view blends a fragment of the surfel."""
+        """[V, N] bool, whether the view blends the surfel."""
         return self.squares > 0
 
     @property
@@ -65,8 +65,8 @@ def visibility(
     """Find the views that show each surfel, and the transmittance in front of it.
 
     Args:
-        surfels: the per-surfel parameters of docs/overview.md, N rows, all finite.
-        near: near plane.
+        surfels: per-surfel parameters (docs/overview.md), N rows, all finite.
+        near: near plane, camera z.
         weight_bound: fragments of smaller weight get no residual.
         alpha: opacities of the surfels' texels; None: opaque texels.
     """
@@ -85,10 +85,7 @@ def visibility(
 
 @torch.no_grad()
 def views_without_surfels(scene: Scene, cameras: Sequence[Camera]) -> list[int]:
-    """List the indices of the views that no surfel is visible in.
-
-    A surfel counts as visible if its bounding sphere extends beyond the near plane and into the image.
-    """
+    """List the indices of the views that no surfel's bounding sphere reaches, beyond the near plane."""
     means = scene.surfels["means"].detach()
     radii = SUPPORT * scene.surfels["log_scales"].detach().exp().amax(-1)
     first = torch.randperm(len(means), generator=torch.Generator().manual_seed(0))[:SAMPLE].to(means.device)

@@ -46,7 +46,7 @@ BUNDLE = "bundle/"
 _NOTES = f"{BUNDLE}{NOTES}"
 SINGLE = "scene.bitymi"  # name of a single-file bundle beside an exported page
 _BUNDLE_TAG = '<meta name="bundle" content="{}" />'
-"""Tag that names the page's single-file bundle; empty: the bundle folder beside the page."""
+"""Names the page's single-file bundle; empty: the bundle folder beside the page."""
 
 
 class PageError(ValueError):
@@ -102,16 +102,16 @@ def media_type(path: str) -> str:
 def page_files() -> dict[str, Callable[[], bytes | bytearray]]:
     """Return readers of the built page's files, by name. Raises PageError: the page was not built."""
     folder = Path(str(resources.files("bitymi_ns.view"))) / "page"
-    found = [path for path in sorted(folder.glob("*")) if path.is_file()]
-    files: dict[str, Callable[[], bytes | bytearray]] = {path.name: path.read_bytes for path in found}
+    paths = [path for path in sorted(folder.glob("*")) if path.is_file()]
+    files: dict[str, Callable[[], bytes | bytearray]] = {path.name: path.read_bytes for path in paths}
     if "index.html" not in files:
         raise PageError(f"the viewer's page is missing from {folder}: in a checkout, build it with `make web`")
     return files
 
 
 def site_of(bundle: Path) -> Site:
-    """Build a site of the page and a bundle; parts of a single-file bundle are served as separate files. Raises
-    PageError: the page was not built; BundleError: there is no bundle, or its bundle.json or notes.json is damaged."""
+    """Build a site of the page and a bundle, whose parts are served as separate files. Raises PageError: the page was
+    not built; BundleError: there is no bundle, or its bundle.json or notes.json is damaged."""
     notes_of(bundle)
     shown = Shown(Path(os.path.realpath(bundle)))
     files = {**page_files(), "view.json": partial(_view_json, bundle)}
@@ -119,8 +119,8 @@ def site_of(bundle: Path) -> Site:
 
 
 def single_site(bundle: Path) -> Site:
-    """Build a site of the page and a single-file bundle, which the page reads by range requests, or as a whole if the
-    server does not support them. Raises as `site_of`."""
+    """Build a site of the page and a single-file bundle, which the page reads by range requests or as a whole. Raises
+    as `site_of`."""
     info, files = read_manifest(bundle), page_files()
     empty, named = (_BUNDLE_TAG.format(name).encode() for name in ("", SINGLE))
     index = files["index.html"]()
@@ -143,8 +143,7 @@ def _view_json(bundle: Path) -> bytes:
 
 
 class Shown:
-    """A bundle being served. Each read checks size and hash of the file against bundle.json; if the bundle is exported
-    again, the new one is served."""
+    """A bundle being served: the current one if it is exported again. Each read checks size and hash of the file."""
 
     def __init__(self, bundle: Path) -> None:
         self._bundle = bundle
@@ -159,7 +158,7 @@ class Shown:
 
     @property
     def names(self) -> list[str]:
-        """Names of the served files; the previous ones if bundle.json cannot be read."""
+        """Names of the served files; the earlier ones if bundle.json cannot be read."""
         with suppress(BundleError):
             self._refresh()
         return [MANIFEST, *(name for name in self.info.files if is_known(name))]
@@ -172,10 +171,10 @@ class Shown:
         """Return a value that changes when bundle.json, or the single file, is written."""
         path = self._bundle if os.path.isfile(self._bundle) else self._bundle / MANIFEST
         try:
-            found = os.stat(path)
+            status = os.stat(path)
         except OSError:  # reported when it is read
             return ()
-        return found.st_ino, found.st_size, found.st_mtime_ns
+        return status.st_ino, status.st_size, status.st_mtime_ns
 
     def read(self, name: str) -> bytes | bytearray:
         """Read a file to serve. Raises BundleError: it is missing, altered, or a link out of the bundle."""
@@ -189,10 +188,9 @@ class Shown:
 
 
 def write_static(site: Site, folder: Path, overwrite: bool = False) -> int:
-    """Write the files of a site to a folder, which is complete or absent; return the bytes written. `overwrite`:
-    replace an exported page. Raises PageError: the folder holds other files, or an exported page without `overwrite`.
-    Raises BundleError: a file of the bundle is missing, altered, or a link out of the bundle. Raises OSError: the
-    folder cannot be written."""
+    """Write the files of a site to a folder, complete or not at all; return the bytes written. Raises PageError: the
+    folder holds other files, or an exported page without `overwrite`. Raises BundleError: as `Shown.read`. Raises
+    OSError: the folder cannot be written."""
 
     def check() -> None:
         has_folder = (folder / BUNDLE / MANIFEST).is_file()

@@ -148,12 +148,12 @@ class _Server(ThreadingHTTPServer):
         self._names = {*LOCAL_NAMES, host.lower(), _shown(self)}
 
     def is_named(self, host: str) -> bool:
-        """Return True if a Host header is allowed; any is if the server does not listen on a loopback address."""
+        """Return True if a Host header is allowed: any, unless the server listens on a loopback address."""
         host = host.lower()
         return not is_loopback(self) or host in self._names or host.rpartition(":")[0] in self._names
 
     def hold(self, name: str) -> _SharedFile:
-        """Read a file, shared until `release` was called once per `hold`; raises what `Site.read` raises."""
+        """Read a file, shared until `release` was called once per `hold`. Raises as `Site.read`."""
         key = (name, self.site.stamp(name))
         with self._count_lock:
             held = self._held.setdefault(key, _SharedFile(key))
@@ -200,9 +200,9 @@ class _Server(ThreadingHTTPServer):
 def serve(
     site: Site, host: str = LOOPBACK, port: int = 0, request_seconds: float = REQUEST_SECONDS
 ) -> ThreadingHTTPServer:
-    """Create a listening server; call its `serve_forever`, and `address_of` for the URL. On a loopback `host`, requests
-    for another host name are refused, against DNS rebinding by web pages. `port`: 0: any free port. `request_seconds`:
-    timeout of receiving a request. Raises PageError: the address cannot be used."""
+    """Create a listening server; call its `serve_forever`. On a loopback `host`, requests for another host name are
+    refused, against DNS rebinding by web pages. `port`: 0: any free port. `request_seconds`: timeout of receiving a
+    request. Raises PageError: the address cannot be used."""
     if not 0 <= port <= 0xFFFF:
         raise PageError(f"the port must be from 0 to 65535, not {port}")
     try:
@@ -213,7 +213,6 @@ def serve(
 
 
 def is_loopback(server: ThreadingHTTPServer) -> bool:
-    """Return True if the server listens on a loopback address."""
     return ipaddress.ip_address(str(server.server_address[0]).partition("%")[0]).is_loopback
 
 

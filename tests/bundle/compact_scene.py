@@ -27,6 +27,13 @@ FINEST = {**REFERENCE, "place": 1e-9}
 """Steps for which positions use every bit of their grid."""
 
 
+def reduced_surfels(kind: str, count: int) -> dict[str, torch.Tensor]:
+    """Make random surfels with reduced view colours."""
+    params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
+    params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
+    return params | reduced_parameters(kind, count, torch.float32)
+
+
 def make_codes(
     kind: str = "sv",
     count: int = 12,
@@ -35,9 +42,7 @@ def make_codes(
     alpha: bool = False,
 ) -> SceneCodes:
     """Build SceneCodes of random surfels, every fourth without a tile, with alpha texels or opaque."""
-    params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
-    params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
-    params |= reduced_parameters(kind, count, torch.float32)
+    params = reduced_surfels(kind, count)
     sizes = torch.tensor([SIDES[i % len(SIDES)] if textured else (0, 0) for i in range(count)])
     surfels, order = code_surfels(params, kind, sizes, torch.linspace(0.5, 3.0, count), steps)
     sizes = sizes[order]

@@ -70,6 +70,8 @@ def test_a_bundle_without_a_digest_and_of_another_version_is_refused():
     for version in ("0.9", "1.3", "2.2", "3.0", "5.0"):
         assert "is read no longer: export it again" in refusal(signed({**INFO, "version": version}))
     assert "update bitymi-ns" in refusal(signed({**INFO, "version": "7.0"}))
+    assert "version must look like" in refusal(signed({**INFO, "version": "one"}))
+    assert parse(signed({**INFO, "version": "6.7", "holograms": {"yes": True}})).holograms == {"yes": True}
 
 
 @pytest.mark.parametrize(

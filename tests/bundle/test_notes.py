@@ -165,7 +165,7 @@ def test_a_bundle_that_replaces_another_keeps_its_notes(folder: Path) -> None:
         warnings.simplefilter("error")
         write_compact(folder, make_codes(count=50), overwrite=True)
     assert (folder / "notes.json").read_bytes() == text()
-    with pytest.warns(UserWarning, match=r"notes\.json is kept, and is in the frame of the earlier scene"):
+    with pytest.warns(UserWarning, match=r"notes\.json is kept, in the frame of the earlier"):
         write_compact(folder, make_codes(count=50), world=World(scale=2.0), overwrite=True)
     assert (folder / "notes.json").read_bytes() == text()
     (folder / "notes.json").unlink()

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from bitymi_ns.bundle import BundleError, check_files, read_bundle
+from bitymi_ns.bundle import check_files, read_bundle
 from bitymi_ns.bundle.manifest import POSTER
 from bitymi_ns.bundle.poster import LEAST, SHARE, SIDE, draw_poster, encode_poster, most_bytes
 from bitymi_ns.bundle.single import write_single
@@ -44,13 +44,9 @@ def test_it_fits_its_bytes() -> None:
     assert most_bytes(10_000_000) == SHARE * 10_000_000 and most_bytes(0) == LEAST
 
 
-@pytest.mark.parametrize("compact", [True, False], ids=["compact", "bc7"])
-def test_it_is_listed(compact: bool, surfels, tmp_path: Path) -> None:
+def test_it_is_listed(surfels, tmp_path: Path) -> None:
     folder = tmp_path / "b"
-    if compact:
-        write_compact(folder, make_codes(), poster=SMOOTH)
-    else:
-        make(surfels, folder, format="bc7", poster=SMOOTH)
+    make(surfels, folder, format="bc7", poster=SMOOTH)
     entry = read_bundle(folder).info.files[POSTER]
     assert entry.bytes == (folder / POSTER).stat().st_size <= LEAST
     assert opened((folder / POSTER).read_bytes()).ndim == 3
@@ -72,14 +68,3 @@ def test_it_comes_second_in_one_file_and_is_checked(tmp_path: Path) -> None:
         assert [check.name for check in check_files(place)[1] if not check.ok] == [POSTER]
         with pytest.warns(UserWarning, match=rf"{POSTER} is altered.* is left out"):
             assert len(read_bundle(place)) == 12
-
-
-def test_a_file_that_no_reader_knows_is_checked_and_not_looked_at(tmp_path: Path) -> None:
-    """Add an optional part, such as the poster, without a version of its own."""
-    folder = write_compact(tmp_path / "b", make_codes(), extra_files={"later.bin": b"of a later version"})
-    assert len(read_bundle(folder)) == 12
-    with pytest.raises(BundleError, match=POSTER):  # a caller's file must not replace it
-        write_compact(tmp_path / "c", make_codes(), extra_files={POSTER: b"x"})
-    (folder / "later.bin").write_bytes(b"of a later Version")
-    with pytest.warns(UserWarning, match=r"later\.bin is altered.* is left out"):
-        read_bundle(folder)

@@ -71,7 +71,7 @@ def test_damage_anywhere_is_refused_or_changes_nothing(single: bytes, tmp_path: 
 def test_what_is_not_packed_and_not_read(single: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(single_module, "machine_memory", lambda: 150_000)  # the preview has 100,000 bytes
-        with pytest.raises(BundleError, match="cannot be packed: one file of it takes 2.* this machine has 150.0 kB"):
+        with pytest.raises(BundleError, match="cannot be packed: that takes 2.* this machine has 150.0 kB"):
             write_single(tmp_path / "b", tmp_path / "c.bitymi")
     with zipfile.ZipFile(tmp_path / "deflated.bitymi", "w", zipfile.ZIP_DEFLATED) as archive:
         for entry in zipfile.ZipFile(io.BytesIO(single)).infolist():

@@ -11,11 +11,13 @@ import torch
 from bitymi_ns import ply
 from bitymi_ns.bundle import BundleError, World, ktx2, read_bundle
 from bitymi_ns.bundle import write as bundle_module
+from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.ops.reference import view_color as reference
 from tests.bake.scenes import write
 from tests.bundle.damage import amend
 from tests.bundle.made import make
+from tests.cuda.baked_scenes import front
 
 
 def names_beside(folder):
@@ -47,6 +49,17 @@ def test_what_is_written_is_read(surfels, tmp_path, kind, format):
         assert error < (1e-6 if format == "fp16" else (2.0 / 255) ** 2 / 11)
     assert error == pytest.approx(atlas.mse, rel=0.2)
     assert loaded.info.atlas.psnr == pytest.approx(atlas.psnr)
+
+
+@pytest.mark.parametrize("correction", [torch.tensor([0.5, 1.0, 2.0]), torch.arange(12.0).view(3, 4), None])
+def test_photographs_keep_their_resolution_and_correction(surfels, tmp_path, correction) -> None:
+    points = torch.tensor([[0.0, 1.0, -2.5, 30.0], [1e-3, 7.0, 0.25, 1e6]])
+    text = cameras_data([CapturedCamera.of("a", front(), True, correction=correction)])
+    make(surfels, tmp_path / "b", photographed=points, extra_files={"cameras.json": text})
+    bundle = read_bundle(tmp_path / "b")
+    assert torch.equal(bundle.scene.photographed, points) and (b"correction" in text) == (correction is not None)
+    (row,) = bundle.cameras
+    assert row.exposure is None if correction is None else torch.equal(row.exposure, correction)
 
 
 @pytest.mark.parametrize("reduced", [False, True])

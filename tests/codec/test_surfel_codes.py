@@ -6,23 +6,16 @@ import torch
 
 from bitymi_ns.codec.limits import EXTENTS, LIMITS
 from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, code_surfels, morton_cells, morton_codes, reordered
-from bitymi_ns.measure.stability.scenes import random_scene
 from bitymi_ns.ops.view_color import view_color
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere
-from tests.ops.test_view_color import reduced_parameters
+from tests.bundle.compact_scene import reduced_surfels
 
 COUNT = 200
 
 
-def reduced(kind: str, count: int = COUNT) -> dict[str, torch.Tensor]:
-    params = {key: value.float() for key, value in random_scene(count, 0).params.items()}
-    params = {key: value for key, value in params.items() if key not in VIEW_COLORS["sv"].names}
-    return params | reduced_parameters(kind, count, torch.float32)
-
-
 @pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
 def test_values_are_within_half_a_step(kind: str) -> None:
-    params = reduced(kind)
+    params = reduced_surfels(kind, COUNT)
     fine = {name: step / 64 for name, step in REFERENCE.items()}
     sizes = torch.tensor([[8, 4]] * COUNT)
     extent = torch.linspace(*EXTENTS, COUNT)
@@ -56,7 +49,7 @@ def test_cells_come_back_from_their_places() -> None:
 
 
 def test_far_surfels_keep_their_limits_and_near_ones_their_places() -> None:
-    params = reduced("sv")
+    params = reduced_surfels("sv", COUNT)
     params["means"][0] = torch.tensor([1e9, -1e9, 3.0])
     codes, order = code_surfels(params, "sv", np.zeros((COUNT, 2)), torch.ones(COUNT), REFERENCE)
     got, want = codes.surfels()["means"], params["means"][order]
@@ -66,7 +59,8 @@ def test_far_surfels_keep_their_limits_and_near_ones_their_places() -> None:
 
 
 def test_coarse_steps_still_make_surfels() -> None:
-    codes, _ = code_surfels(reduced("sv"), "sv", np.zeros((COUNT, 2)), torch.ones(COUNT), dict.fromkeys(REFERENCE, 1.0))
+    surfels, steps = reduced_surfels("sv", COUNT), dict.fromkeys(REFERENCE, 1.0)
+    codes, _ = code_surfels(surfels, "sv", np.zeros((COUNT, 2)), torch.ones(COUNT), steps)
     got = codes.surfels()
     assert all(bool(value.isfinite().all()) for value in got.values())
     torch.testing.assert_close(got["quats"].norm(dim=1), torch.ones(COUNT))

@@ -12,6 +12,7 @@ from PIL import Image
 
 from bitymi_ns import cli
 from bitymi_ns.bundle import Bundle, BundleError, check_files, read_bundle
+from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.read import read_cameras
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.interchange import extras
@@ -24,14 +25,6 @@ from tests.interchange.glb import read_glb
 from tests.typed import Patch, Printed
 
 
-def row(camera, name: str, held_out: bool, **more) -> dict:
-    K = camera.K.tolist()
-    size = {"width": camera.width, "height": camera.height, "viewmat": camera.viewmat.flatten().tolist()}
-    return {
-        "name": name, "held_out": held_out, **size, "fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2], **more
-    }  # fmt: skip
-
-
 def positions(path: Path) -> torch.Tensor:
     vertex = parse_ply(path.read_bytes())["vertex"]
     return torch.from_numpy(np.stack([vertex[name] for name in "xyz"], 1))
@@ -42,9 +35,10 @@ def with_cameras(surfels, camera, tmp_path: Path) -> Path:
     """Write a bundle with cameras.json and a photograph of half its camera's size."""
     buffer = io.BytesIO()
     Image.fromarray(np.full((24, 32, 3), 90, np.uint8)).save(buffer, format="PNG")
-    rows = [row(camera(6.0), "a.jpg", False), row(camera(7.0), "b.jpg", False)]
-    rows += [row(camera(6.5), "c.jpg", True, photograph="photograph-0001.jpg"), row(camera(8.0), "d.jpg", True)]
-    files = {"cameras.json": json.dumps({"cameras": rows}).encode(), "photograph-0001.jpg": buffer.getvalue()}
+    views = [("a.jpg", camera(6.0), False), ("b.jpg", camera(7.0), False), ("d.jpg", camera(8.0), True)]
+    views.append(("c.jpg", camera(6.5), True, "photograph-0001.jpg"))
+    files = {"cameras.json": cameras_data(CapturedCamera.of(*view) for view in views)}
+    files["photograph-0001.jpg"] = buffer.getvalue()
     make(surfels, tmp_path / "scene", count=12, mean_residual=torch.zeros(12, 3), extra_files=files)
     return tmp_path / "scene"
 

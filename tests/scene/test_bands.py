@@ -69,32 +69,25 @@ def test_lists_that_fit_are_the_whole_view(most: int) -> None:
     torch.testing.assert_close(without.rgb, whole.rgb.detach(), rtol=1e-12, atol=1e-12)
 
 
-def test_memory_bounds_a_list_where_nothing_else_does(monkeypatch: pytest.MonkeyPatch) -> None:
+REFUSED = "[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory"  # torch's words
+allocate = trace_cpu.empty_list
+
+
+def scarce(like: torch.Tensor, count: int) -> dict[str, torch.Tensor]:
+    if count > 1500:
+        raise RuntimeError(REFUSED)
+    return allocate(like, count)
+
+
+@pytest.mark.parametrize("limit", [("MOST", 1500), ("empty_list", scarce)])
+def test_a_list_that_memory_does_not_hold_is_drawn_in_bands(limit: tuple, monkeypatch: pytest.MonkeyPatch) -> None:
     whole, want = bands.step(CPU, 0)
-    monkeypatch.setattr(trace_cpu, "MOST", 1500)
+    monkeypatch.setattr(trace_cpu, *limit)
     parts, got = bands.step(CPU, 0)
     assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Unlisted)
     bands.assert_same(got, want)
     found = list(ops.fitting_lists(parts.projection))
     assert len(found) > 1 and all(len(f) <= 1500 for f in found)
-
-
-REFUSED = "[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory"  # torch's words
-
-
-def test_a_list_that_memory_does_not_hold_is_drawn_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, want = bands.step(CPU, 0)
-    allocate = trace_cpu.empty_list
-
-    def scarce(like: torch.Tensor, count: int) -> dict[str, torch.Tensor]:
-        if count > 1500:
-            raise RuntimeError(REFUSED)
-        return allocate(like, count)
-
-    monkeypatch.setattr(trace_cpu, "empty_list", scarce)
-    parts, got = bands.step(CPU, 0)
-    assert isinstance(whole, ops.Fragments) and isinstance(parts, ops.Unlisted)
-    bands.assert_same(got, want)
     scene, camera = bands.make(CPU, 0)
     monkeypatch.setattr(scene_module, "blended_image", Mock(side_effect=RuntimeError(REFUSED)))
     with pytest.raises(MemoryError, match="the picture does not fit into memory: .*can't allocate memory"):

@@ -1,7 +1,6 @@
 """A small bundle with cameras and a photograph."""
 
 import io
-import json
 import math
 from dataclasses import replace
 from functools import lru_cache
@@ -17,6 +16,7 @@ from bitymi_ns.bake.field.tiles import field_tiles
 from bitymi_ns.bake.pipeline import trained_texels
 from bitymi_ns.bake.stages import with_means
 from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.codec.pages import joined, tile_means
 from bitymi_ns.scene import Camera
 from tests.bake.conftest import make_surfels
@@ -82,20 +82,11 @@ def write(
     camera.viewmat[:3, 3] *= unit
     picture = io.BytesIO()
     Image.new("RGB", (WIDTH, HEIGHT), (200, 80, 40)).save(picture, "JPEG")
-    K = camera.K.tolist()
-    row = {
-        **{"name": "first.jpg", "held_out": True, "width": WIDTH, "height": HEIGHT},
-        **{"fx": K[0][0], "fy": K[1][1], "cx": K[0][2], "cy": K[1][2]},
-        **{"viewmat": camera.viewmat.flatten().tolist(), "photograph": "photograph-0001.jpg"},
-    }
     moved = camera.viewmat.clone()
     moved[0, 3] = 0.5 * unit
-    other = {**row, "name": "second.jpg", "held_out": False, "viewmat": moved.flatten().tolist()}
-    del other["photograph"]
-    extra = {
-        "cameras.json": json.dumps({"cameras": [row, other]}).encode(),
-        "photograph-0001.jpg": picture.getvalue(),
-    }
+    rows = [CapturedCamera.of("first.jpg", camera, True, "photograph-0001.jpg")]
+    rows.append(CapturedCamera.of("second.jpg", camera.posed(moved), False))
+    extra = {"cameras.json": cameras_data(rows), "photograph-0001.jpg": picture.getvalue()}
     baked = baked_scene(format, count, compact, seen, kind, larger, alpha, tuple(options.items()))
     if near is not None:
         baked = replace(baked, scene=replace(baked.scene, near=near))

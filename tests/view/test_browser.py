@@ -18,7 +18,6 @@ from PIL import Image
 from bitymi_ns.bundle import ktx2, read_bundle
 from bitymi_ns.bundle.single import write_single
 from bitymi_ns.scene.baked import BakedScene
-from bitymi_ns.scene.sampling import averaged
 from bitymi_ns.train.losses import psnr
 from bitymi_ns.view import Site, site_of, write_static
 from tests.bundle.damage import amend
@@ -71,18 +70,6 @@ def test_frames_are_those_of_the_cpu_renderer(
     assert not found.problems
     mean, largest = difference(tmp_path / "p.png", bundle, share)
     assert mean < MEAN and largest < 12 / 255
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("share, least", [(0.25, 47.0), (0.125, 45.7)])
-def test_far_views_are_averages_of_near_ones(share: float, least: float, tmp_path: Path) -> None:
-    bundle = write(tmp_path / "b", "uint8", compact=True, seen=True, alpha=True, larger=0.7)
-    with served(site_of(bundle)) as address:
-        steps = [["goto", address], ["settle"], ["save", "#screenshot", tmp_path / "p.png"]]
-        assert not drive(steps, (round(WIDTH * share), round(HEIGHT * share))).problems
-    got = torch.from_numpy(pixels(tmp_path / "p.png"))
-    full = read_bundle(bundle).scene.render(view()).rgb[None]
-    assert psnr(got, averaged({"rgb": full}, round(1 / share))["rgb"][0].clamp(0, 1)) > least
 
 
 @pytest.mark.slow

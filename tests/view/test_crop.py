@@ -30,6 +30,13 @@ def click(at: tuple[int, int]) -> list[object]:
     return ["drag", at, at]
 
 
+def measure() -> list[list[object]]:
+    """Measure from `FIRST` to `SECOND`."""
+    steps = [["press", "#measure"], ["press", "#add-measure"], click(FIRST)]
+    steps += [["until", "document.querySelector('.ends').getAttribute('d')"], click(SECOND)]
+    return [*steps, ["until", f"{LABELS}.includes('units')"]]
+
+
 def slide(name: str, value: float) -> list[object]:
     """Move a slider, as a drag with a release does."""
     of = f"document.querySelector('[aria-label=\"{name}\"]')"
@@ -42,9 +49,7 @@ def cropped(solid: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     """A bundle with notes.json from the page, and what the page showed: surfels, labels of measures."""
     folder = tmp_path_factory.mktemp("cropped")
     page = Steps()
-    page.do(["press", "#measure"], ["press", "#add-measure"], click(FIRST))
-    page.do(["until", "document.querySelector('.ends').getAttribute('d')"], click(SECOND))
-    page.do(["until", f"{LABELS}.includes('units')"], ["fill", "#known", "2"], ["press", "#set-unit"])
+    page.do(*measure(), ["fill", "#known", "2"], ["press", "#set-unit"])
     labels = page.ask(LABELS)
     page.do(["press", "#crop"], ["press", "#crop-hide"], click(FIRST))
     page.do(["until", "!document.getElementById('hide-selected').hidden"])
@@ -133,9 +138,7 @@ def test_a_device_that_blends_half_floats_measures_scenes_of_any_size(tmp_path: 
     lengths = []
     for unit, script in ((1.0, ""), (1.0, HALF), (1e5, HALF), (1e-5, HALF)):
         page = Steps()
-        page.do(["press", "#measure"], ["press", "#add-measure"], click(FIRST))
-        page.do(["until", "document.querySelector('.ends').getAttribute('d')"], click(SECOND))
-        page.do(["until", f"{LABELS}.includes('units')"])
+        page.do(*measure())
         label, hint = page.ask(LABELS), page.ask("document.getElementById('measure-hint').textContent")
         page.run(write(tmp_path / f"{unit} {len(script)}", larger=1.5, unit=unit), drawn=True, script=script)
         lengths.append(float(page[label].split()[0]) / unit)
@@ -170,9 +173,7 @@ def test_keys_end_what_they_should(solid: Path) -> None:
     cancelled = page.ask(f"document.querySelector('.ends').getAttribute('d') + {pressed}")
     page.do(["key", "Escape"])
     closed = page.ask(pressed)
-    page.do(["press", "#measure"], ["press", "#add-measure"], click(FIRST))
-    page.do(["until", "document.querySelector('.ends').getAttribute('d')"], click(SECOND))
-    page.do(["until", f"{LABELS}.includes('units')"], ["click", "#known"], ["key", "3"], ["key", "Enter"])
+    page.do(*measure(), ["click", "#known"], ["key", "3"], ["key", "Enter"])
     length = page.ask(LABELS)
     page.do(["press", "#crop"], ["press", "#crop-box"], ["press", "#undo"])
     undone = page.ask(f"document.getElementById('crop-hint').textContent + {pressed}")

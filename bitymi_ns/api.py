@@ -1,5 +1,4 @@
-"""Public functions: load a capture, rasterize surfels, train a scene, bake it, read a bundle. None of them needs
-nerfstudio."""
+"""Public functions, none of which needs nerfstudio."""
 
 import copy
 from collections.abc import Callable, Sequence

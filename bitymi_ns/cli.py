@@ -1,5 +1,4 @@
-"""Subcommands of the `bitymi` console script. Training, baking and evaluation are nerfstudio's commands: ns-train,
-ns-export, ns-eval."""
+"""Subcommands of the `bitymi` console script."""
 
 import os
 import sys
@@ -20,7 +19,7 @@ from .trust import listed, printable
 
 
 def say(text: object, to: TextIO | None = None) -> None:
-    """Print a line and flush, with control characters, e.g. of file names, escaped."""
+    """Print a line and flush, with control characters escaped."""
     print(printable(str(text)), file=to or sys.stdout, flush=True)
 
 
@@ -87,7 +86,7 @@ class Report:
     """Turn ns-eval results and training logs into one page: tables and plots of error against time."""
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
-    """JSON files of ns-eval, cells of `bitymi bench`, training curves, images, and folders to search for these."""
+    """JSON files of ns-eval, cells of `bitymi bench`, training curves, images, and folders with these."""
     output_dir: Path = Path("report")  # Folder to write the page to.
     title: str = "bitymi report"  # Heading of the page.
 
@@ -144,7 +143,7 @@ class Verify:
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file (bitymi pack).
     run_config: Annotated[Path | None, tyro.conf.arg(name="run")] = None
-    """config.yml, folder or checkpoint of the run: also compare residuals and renders of the bundle with the run's."""
+    """config.yml, folder or checkpoint of the run: also compare the bundle's residuals and renders with the run's."""
     views: int | None = None  # Held-out views of the run to render; not given: 4.
 
     def run(self) -> int:
@@ -269,7 +268,7 @@ class View:
     one_file: Flag = False  # With --export: write the bundle as one file, which the page reads by range requests.
     overwrite: Flag = False  # Replace an exported page.
     host: str = "127.0.0.1"
-    """Address to listen on. On an address other than loopback, everyone who can reach this machine sees the bundle."""
+    """Address to listen on. On one other than loopback, everyone who can reach this machine sees the bundle."""
     port: int = 0  # Port to listen on; 0 = any free port.
     open_browser: bool = True  # Open the page in the browser.
 
@@ -319,7 +318,6 @@ class Doctor:
 
 
 Command = Sample | Sfm | Report | Stability | Bench | Verify | Pack | Unpack | Extras | Doctor | View
-"""Subcommands, by the names of their classes."""
 
 
 def main(args: Sequence[str] | None = None) -> int:

@@ -1,4 +1,4 @@
-"""Termination of commands with one line and no traceback: on interrupts, closed pipes, and lack of space or memory."""
+"""End commands with one line, without traceback: on interrupts, closed pipes, and lack of space or memory."""
 
 import atexit
 import errno
@@ -36,12 +36,12 @@ _then: Callable[[], str] = str  # see `install`
 
 
 def out_of_memory(error: BaseException) -> bool:
-    """Return True for a MemoryError, and for the errors that torch, CUDA, OpenCV and the system raise in its place."""
+    """Test for a MemoryError, or what torch, CUDA, OpenCV and the system raise in its place."""
     return isinstance(error, MemoryError) or isinstance(error, Exception) and _NO_MEMORY.search(str(error)) is not None
 
 
 def line_of(error: BaseException) -> str | None:
-    """Describe an exception for the user: what is wrong, where, and what to do. None: it is a bug, and deserves its
+    """Describe an exception for the user: what is wrong, where, and what to do; None for a bug, which deserves its
     traceback."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
@@ -62,8 +62,8 @@ def line_of(error: BaseException) -> str | None:
 
 
 def end_as_by_ctrl_c() -> list[signal.Signals]:
-    """Have the signals of batch systems and of terminals that are gone raise KeyboardInterrupt, so that what was begun
-    is removed; those that are handled or ignored stay as they are. Return those that have changed."""
+    """Have the signals of batch systems and of terminals that are gone raise KeyboardInterrupt, unless they are handled
+    or ignored. Return those that have changed."""
     if threading.current_thread() is not threading.main_thread():
         return []
     changed = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
@@ -78,7 +78,7 @@ def _end_by_default(numbers: Sequence[int]) -> None:
 
 
 def run(command: Callable[[], int]) -> int:
-    """Run a command and return its exit status, also after exceptions that `line_of` describes; ends silently if its
+    """Run a command and return its exit status, also after exceptions that `line_of` describes; end silently if its
     output is a closed pipe, as with `| head`."""
     changed = end_as_by_ctrl_c()
     try:
@@ -133,8 +133,8 @@ def outlive_output() -> None:
 
 
 def install(then: Callable[[], str] = str) -> None:
-    """Handle uncaught exceptions of this process as `run` does, in commands of other packages. `then`: returns what to
-    do after memory ran out, beside the usual."""
+    """Handle uncaught exceptions as `run` does, in commands of other packages. `then`: returns what to do after memory
+    ran out, beside the usual."""
     global _then
     _then, before = then, sys.excepthook
     atexit.register(_end_by_default, end_as_by_ctrl_c())  # the interpreter prints exceptions of its own shutdown

@@ -1,8 +1,8 @@
 """Atomic writes of files and folders, and explanations of failed writes.
 
 Files are written as `.NAME.unfinished`, folders as `.NAME.new`, flushed, then renamed; a replaced folder is `.NAME.old`
-in between. Writers hold a lock, which the kernel releases when they end. The names are fixed, so that the next writer
-finds the remains of a killed process, and restores or removes them."""
+in between. Writers hold a lock. The names are fixed, so that the next writer finds the remains of a killed process, and
+restores or removes them."""
 
 from __future__ import annotations
 
@@ -54,8 +54,8 @@ def reason(error: OSError, path: Path) -> str:
 
 @contextmanager
 def write_errors_as(path: Path, kind: type[BaseException], then: str = "") -> Iterator[None]:
-    """Convert OSErrors in the block to exceptions of type `kind` that explain why `path` cannot be written; `then` is
-    appended to the message. Errors that name a file elsewhere pass."""
+    """Convert OSErrors to exceptions of type `kind` that explain why `path` cannot be written; `then` is appended to
+    the message. Errors that name a file elsewhere pass."""
     try:
         yield
     except OSError as error:
@@ -65,7 +65,7 @@ def write_errors_as(path: Path, kind: type[BaseException], then: str = "") -> It
 
 
 def _concerns(name: object, path: Path) -> bool:
-    """Return True for an error's file that is in the way of writing `path`, belongs to the result, or is unknown."""
+    """Test if an error's file is in the way of writing `path`, belongs to the result, or is unknown."""
     if not isinstance(name, (str, os.PathLike)):
         return True
     near, place = Path(os.path.realpath(name)), Path(os.path.realpath(path))
@@ -79,7 +79,7 @@ size_text = decimal  # a number of bytes in decimal units
 
 
 def free_bytes(path: Path) -> int:
-    """Return the free space for a file or folder, which need not exist, nor its parents."""
+    """Return the free space for a file or folder, which need not exist."""
     return shutil.disk_usage(_nearest(path.absolute())).free
 
 
@@ -103,13 +103,11 @@ def parents_of(path: Path) -> Iterator[None]:
 @contextmanager
 def reserved(target: str | Path, check: Callable[[], None] | None = None, tell: Tell = warnings.warn) -> Iterator[Path]:
     """Lock the path of a file or folder, and repair the remains of a killed process there; yield it with links
-    resolved. Since this writes beside the target, it fails early if nothing can be written there. Missing parents are
-    created, and removed if they remain empty. Reservations of one thread may be nested.
+    resolved. Missing parents are created, and removed if they remain empty. Reservations of one thread may be nested.
 
     `check`: for a folder: raises if the existing one may not be replaced; None: the target is a file. `tell`: called if
-    the file system has no locks. Raises Busy: another process is writing it. Raises OSError: nothing can be written
-    there, or it is a folder instead of a file, or a file or a link to nothing instead of a folder; `reason` says
-    why."""
+    the file system has no locks. Raises Busy: another process is writing it; OSError: nothing can be written there, or
+    it is a folder instead of a file, or a file or a link to nothing instead of a folder; `reason` says why."""
     place = Path(os.path.realpath(target))
     kind = errno.EBUSY if os.path.ismount(place) else 0
     if not kind and os.path.lexists(target) and place.is_dir() != (check is not None):
@@ -133,8 +131,8 @@ def reserved(target: str | Path, check: Callable[[], None] | None = None, tell: 
 
 
 def _check_movable(place: Path) -> None:
-    """Check that what is there can be replaced, which its attributes, or an overlay of which a lower layer has it, can
-    prevent. A folder is not moved: no file system renames it onto one that holds something."""
+    """Check that what is there can be replaced, which attributes or an overlay's lower layer can prevent. A folder is
+    not moved: no file system renames it onto one that holds something."""
     if not place.is_dir():
         try:
             os.close(os.open(place, os.O_WRONLY | os.O_NONBLOCK))
@@ -157,19 +155,19 @@ def _check_movable(place: Path) -> None:
 
 
 def check_writable(target: Path) -> None:
-    """Check in advance that a file can be written; raises what `reserved` raises."""
+    """Check in advance that a file can be written; raises as `reserved`."""
     if not _is_device(target):
         with reserved(target):
             pass
 
 
 def check_folder(folder: Path) -> None:
-    """Check in advance that files can be written into a folder, which need not exist; raises what `reserved` raises."""
+    """Check in advance that files can be written into a folder; raises as `reserved`."""
     check_writable(folder / UNFINISHED)
 
 
 def _is_device(path: Path) -> bool:
-    """Return True for a device or a pipe, such as /dev/stdout."""
+    """Test for a device or a pipe, such as /dev/stdout."""
     return path.exists() and not path.is_file() and not path.is_dir()
 
 
@@ -178,8 +176,7 @@ def _temporary_paths(place: Path) -> tuple[Path, Path]:
 
 
 def _recover(place: Path) -> None:
-    """Complete or undo an interrupted replacement: keep the new folder if complete, else restore the old one. The
-    caller holds the lock."""
+    """Complete or undo an interrupted replacement: keep the new folder if complete, else restore the old one."""
     new, old = _temporary_paths(place)
     _remove(new)
     if is_left(old):
@@ -201,9 +198,9 @@ def complete_folder(
 ) -> Iterator[Path]:
     """Create a temporary folder, which is yielded, and replaces the target if the block ends without an exception.
 
-    After any exception, including KeyboardInterrupt, the target is unchanged. After a kill it is the old or the new
-    folder, or both are beside it until the next writer repairs that. `check`: raises if the existing target may not be
-    replaced; called before and after the block. Missing parents are created. Raises as `reserved`."""
+    After an exception the target is unchanged. After a kill it is the old or the new folder, or both are beside it
+    until the next writer repairs that. `check`: raises if the existing target may not be replaced; called before and
+    after the block. Raises as `reserved`."""
     with reserved(target, check, tell) as place:
         new, old = _temporary_paths(place)
         try:
@@ -224,10 +221,10 @@ def complete_folder(
 
 @contextmanager
 def complete_file(path: Path, scratch: Path | None = None, follow: bool = False) -> Iterator[BinaryIO]:
-    """Open a temporary file that replaces `path` if the block ends without an exception; missing parents are created.
-    `follow`: write through a link, for a path that the user gave; False: replace the link, for files of a folder that
-    may come from others. `scratch`: folder on the same file system for the unfinished file; None: that of `path`.
-    Raises Busy: another process is writing it. Raises OSError: it cannot be written; `reason` says why."""
+    """Open a temporary file that replaces `path` if the block ends without an exception. `follow`: write through a
+    link, for a path that the user gave; False: replace the link, for files of a folder that may come from others.
+    `scratch`: folder on the same file system for the unfinished file; None: that of `path`. Raises Busy: another
+    process is writing it; OSError: it cannot be written; `reason` says why."""
     path = Path(os.path.realpath(path)) if follow else path
     unfinished = (scratch or path.parent) / f".{path.name}{UNFINISHED}"
     with parents_of(path):
@@ -252,7 +249,7 @@ def complete_file(path: Path, scratch: Path | None = None, follow: bool = False)
 
 
 def copy_files(folder: Path, to: Path) -> None:
-    """Copy the files of a folder to a new one; unlike `shutil.copytree`, raises the first error at once."""
+    """Copy a folder's files to a new one; unlike `shutil.copytree`, raise the first error at once."""
     to.mkdir(parents=True)
     for path in sorted(folder.iterdir()):
         if path.is_file():
@@ -260,7 +257,7 @@ def copy_files(folder: Path, to: Path) -> None:
 
 
 def write_file(path: Path, data: bytes, follow: bool = False) -> None:
-    """Write a file atomically, see `complete_file`; devices and pipes are written directly."""
+    """Write a file by `complete_file`; devices and pipes directly."""
     if _is_device(path):
         path.write_bytes(data)
         return
@@ -269,7 +266,7 @@ def write_file(path: Path, data: bytes, follow: bool = False) -> None:
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove unfinished files of ended processes; errors are ignored."""
+    """Remove unfinished files of ended processes, if possible."""
     for path in folder.glob(f".*{UNFINISHED}"):
         with suppress(OSError):
             file, locked = open_locked(path)

@@ -19,7 +19,7 @@ Tell = Callable[[str], None]  # receives a warning for the user
 
 
 class Busy(BlockingIOError):
-    """Error if another process writes the same file or folder; `who` names it, if known, and says what to do."""
+    """Another process writes the same file or folder; `who` names it, if known, and says what to do."""
 
     def __init__(self, who: str) -> None:
         super().__init__(errno.EAGAIN, who)
@@ -30,7 +30,7 @@ class Busy(BlockingIOError):
 
 
 def open_locked(path: Path) -> tuple[BinaryIO, bool]:
-    """Open or create a file for writing, and lock it until all processes that have it open close it. Returns the file,
+    """Open or create a file for writing, and lock it until all processes that have it open close it. Return the file,
     and False if the file system has no locks. Raises BlockingIOError: another process has it; OSError: it cannot be
     opened, or is refused by `no_links`."""
     while True:
@@ -49,12 +49,12 @@ def open_locked(path: Path) -> tuple[BinaryIO, bool]:
 
 
 class Lock:
-    """Lock file of one process. It contains the process's number, for the message to others, and is removed on release;
-    the file of a killed process does not block."""
+    """Lock file of one process, with its number for the message to others. It is removed on release; that of a killed
+    process does not block."""
 
     def __init__(self, path: Path, tell: Tell = warnings.warn) -> None:
         """Lock the file `path`, whose folder must exist. `tell`: called if the file system has no locks; the lock is
-        then ineffective. Raises Busy: another process holds it. Raises OSError: the file cannot be created."""
+        then ineffective. Raises Busy: another process holds it; OSError: the file cannot be created."""
         self.path, self._owner = path, os.getpid()
         try:
             self._file, locked = open_locked(path)
@@ -65,7 +65,7 @@ class Lock:
         self.name(self._owner)
 
     def name(self, process: int) -> None:
-        """Write the working process's number to the file, for the message to others; write errors are ignored."""
+        """Write the working process's number to the file, if possible."""
         with suppress(OSError):
             self._file.seek(0)
             self._file.truncate()

@@ -1,5 +1,5 @@
-"""Reader of PLY files, binary or text: header, and the rows of an element; writer of binary ones. plyfile is not used:
-it is under the GPL, and allocates memory for as many rows of text as a header claims."""
+"""Read PLY files, binary or text, and write binary ones. plyfile is not used: it is under the GPL, and allocates memory
+for as many rows of text as a header claims."""
 
 import re
 import warnings
@@ -32,7 +32,7 @@ _END = re.compile(rb"\nend_header[ \t]*\r?\n")
 
 
 class PlyError(ValueError):
-    """The data is no PLY file, or not of the required kind; the message says what is wrong."""
+    """The data is no PLY file, or not of the required kind."""
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,12 @@ class Header:
 
 
 def read_header(path: Path) -> Header:
-    """Read the header of a file; raises what `parse_header` raises."""
     with open_regular(path) as file:
         return parse_header(file.read(HEADER_LIMIT))
 
 
 def parse_header(data: bytes | bytearray) -> Header:
-    """Parse the header from a file's contents, or its first `HEADER_LIMIT` bytes. Raises PlyError: there is no header,
-    or it is malformed."""
+    """Parse the header from a file's contents, or its first `HEADER_LIMIT` bytes. Raises PlyError."""
     end = _END.search(data, 0, HEADER_LIMIT)
     if not _MAGIC.match(data) or end is None:
         raise PlyError("not a PLY file")
@@ -161,8 +159,8 @@ def write_ply(
     comments: Sequence[str] = (),
     more: Mapping[str, Mapping[str, npt.NDArray]] | None = None,
 ) -> None:
-    """Write columns [N] as properties of `vertex`, binary little-endian, in order: uint8 as `uchar`, other integers as
-    `int`, others as `float`. `comments`: lines of the header. `more`: columns of further elements by name, in order."""
+    """Write columns [N] as properties of `vertex`, binary little-endian: uint8 as `uchar`, other integers as `int`,
+    others as `float`. `comments`: lines of the header. `more`: columns of further elements by name."""
     header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
     body = []
     for element, properties in {"vertex": columns, **(more or {})}.items():
@@ -212,8 +210,8 @@ def header_of(data: bytes | bytearray, size: int) -> Header:
 
 
 def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
-    """Parse a whole file: element to name to [N] float32 or int32 array, in the file's order; the first element is
-    `vertex`. Raises PlyError: as `header_of`, or a value is not finite."""
+    """Parse a whole file: element to name to [N] float32 or int32 array, in the file's order. Raises PlyError: as
+    `header_of`, or a value is not finite."""
     header = header_of(data, len(data))
     elements, at = {}, header.start
     for element, declared in header.elements.items():

@@ -4,8 +4,8 @@ from pathlib import Path
 
 
 def preset_dir() -> Path:
-    """Find the folder of the presets: inside the installed package, or beside it in a source checkout. Raises
-    FileNotFoundError: it is missing."""
+    """Find the folder of the presets: in the installed package, or beside it in a source checkout. Raises
+    FileNotFoundError."""
     package = Path(__file__).resolve().parent
     for folder in (package / "method_configs", package.parent / "method_configs"):
         if folder.is_dir():

@@ -11,13 +11,12 @@ class Progress(Protocol):
     def __call__(self, step: str, done: int, total: int) -> None: ...
 
 
-def no_progress(step: str, done: int, total: int) -> None:
-    """Do nothing."""
+def no_progress(step: str, done: int, total: int) -> None: ...
 
 
 @contextmanager
 def rich_progress() -> Iterator[Progress]:
-    """Create a callback that draws one bar per step; `with rich_progress() as progress: bake(..., progress)`."""
+    """Create a callback that draws one bar per step."""
     from rich.progress import Progress as Bars  # lazily: only needed in a terminal
     from rich.progress import TaskID
 

@@ -24,7 +24,7 @@ def first_problem(error: ValidationError) -> tuple[str, str]:
 
 
 def describe_problems(error: ValidationError) -> str:
-    """Describe the first three validation errors in one line: location, expected, found."""
+    """Describe the first three validation errors in one line."""
     found = error.errors(include_url=False, include_context=False)
     more = len(found) - _MOST_PROBLEMS
     return "; ".join(map(_problem, found[:_MOST_PROBLEMS])) + (f" (and {more} more)" if more > 0 else "")
@@ -48,8 +48,8 @@ def short(value: Any) -> str:
 
 
 def check_ranges(options: Any) -> None:
-    """Check that options are within their ranges. Raises ValueError: one is not, or is NaN; the message has the option,
-    its range and the value."""
+    """Check that options are within their ranges. Raises ValueError: one is not; the message has the option, its range
+    and the value."""
     try:
         TypeAdapter(type(options)).validate_python(asdict(options))
     except ValidationError as error:

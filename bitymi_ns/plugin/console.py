@@ -1,4 +1,4 @@
-"""Console messages: errors without a traceback, warnings, a step bar."""
+"""Console messages: errors without traceback, warnings, a step bar."""
 
 import functools
 import logging
@@ -18,8 +18,8 @@ from bitymi_ns.trust import printable
 
 @contextmanager
 def step_bar(done: int, total: int) -> Iterator[Callable[[int, float | None], None]]:
-    """Show a progress bar below other output in a terminal; yield the function to call with a finished step's index,
-    and the seconds to the end if they are known."""
+    """Show a progress bar in a terminal; yield the function to call with a finished step's index and the seconds left,
+    if known."""
     columns = (TextColumn("step"), MofNCompleteColumn(), BarColumn(), TextColumn("{task.fields[left]}"))
     hidden = not CONSOLE.is_terminal
     with Progress(*columns, console=CONSOLE, refresh_per_second=2, transient=True, disable=hidden) as bar:
@@ -38,8 +38,8 @@ def duration(seconds: float) -> str:
 
 
 class InputError(SystemExit):
-    """Wrong input. Python prints the message to stderr and exits with status 1. nerfstudio's commands handle no errors:
-    an Exception would end in a traceback, which hides what the user can do."""
+    """Wrong input: Python prints the message to stderr and exits with status 1. nerfstudio's commands handle no errors,
+    so an Exception would end in a traceback."""
 
     def __init__(self, message: str) -> None:
         super().__init__(printable(f"bitymi: {message}"))
@@ -63,7 +63,7 @@ def warn(message: str) -> None:
 
 @contextmanager
 def as_input_error() -> Iterator[None]:
-    """Convert a CaptureError to an InputError; also a decorator."""
+    """Convert a CaptureError to an InputError."""
     try:
         yield
     except CaptureError as error:
@@ -71,8 +71,6 @@ def as_input_error() -> Iterator[None]:
 
 
 class _Console(logging.Handler):
-    """Log handler that prints reports on captures."""
-
     def emit(self, record: logging.LogRecord) -> None:
         (warn if record.levelno >= logging.WARNING else say)(record.getMessage())
 

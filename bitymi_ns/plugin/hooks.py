@@ -1,5 +1,5 @@
-"""Change nerfstudio's functions and what they read, which no other module does: its registry and subclasses serve for
-the rest. Each function states what it changes, for which commands, what is lost without it, and what would end it."""
+"""Change nerfstudio's functions and what they read, where its registry and subclasses do not suffice. Each function
+states what it changes, for which commands, what is lost without it, and what would make it superfluous."""
 
 import os
 import sys
@@ -32,14 +32,15 @@ _MESH = (
     "`ns-export bitymi-mesh` writes the surface, a mesh whose vertices are points with colors; `bitymi extras BUNDLE` "
     "Gaussian splats."
 )
-REFUSED = {
-    "ExportPointCloud": f"ns-export pointcloud needs rays, and surfels are drawn as whole pictures. {_MESH}",
-    "ExportTSDFMesh": f"ns-export tsdf needs rays, and surfels are drawn as whole pictures. {_MESH}",
-    "ExportPoissonMesh": f"ns-export poisson needs rays, and surfels are drawn as whole pictures. {_MESH}",
-    "ExportMarchingCubesMesh": f"ns-export marching-cubes needs a field of distances, which surfels have not. {_MESH}",
-    "ExportGaussianSplat": f"ns-export gaussian-splat is for splatfacto. {_MESH}",
+_RAYS = "needs rays, and surfels are drawn as whole pictures"
+_REFUSED = {
+    "ExportPointCloud": f"pointcloud {_RAYS}",
+    "ExportTSDFMesh": f"tsdf {_RAYS}",
+    "ExportPoissonMesh": f"poisson {_RAYS}",
+    "ExportMarchingCubesMesh": "marching-cubes needs a field of distances, which surfels have not",
+    "ExportGaussianSplat": "gaussian-splat is for splatfacto",
 }
-"""Classes of nerfstudio's scripts that cannot work on surfels, and remedies."""
+"""Classes of nerfstudio's exporter that cannot work on surfels: their commands, and why."""
 COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 EXPORTER, VIEWER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.viewer.run_viewer"
 LOOPBACK = "127.0.0.1"  # reachable from this machine alone, unlike nerfstudio's default 0.0.0.0
@@ -49,9 +50,8 @@ HOST_OPTION = "--viewer.websocket-host"
 def read_names_of_callers() -> None:
     """Have nerfstudio's list of external methods read its callers' names without opening their source files.
 
-    Changes: `inspect` in the list's namespace; it asks for the stack for each of its 26 entries. For: every ns-*
-    command. Without: half of a command's start is spent there. Superfluous once nerfstudio asks for the one name that
-    it reads.
+    Changes: `inspect` in the list's namespace, which asks for the stack 26 times. For: every ns-* command. Without: it
+    takes half of a command's start. Superfluous once nerfstudio reads only the name that it needs.
     """
     listing: Any = external_methods
     listing.inspect = SimpleNamespace(
@@ -62,10 +62,9 @@ def read_names_of_callers() -> None:
 def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
     """Add commands to ns-export.
 
-    Changes: `tyro` in the namespace of nerfstudio's script, which loads the plugin before it builds its commands'
-    union: `cli` gets the union with these. For: ns-export. Without: `ns-export bitymi-atlas` and `bitymi-mesh` are
-    unknown. Superfluous once nerfstudio has a registry of exports. Errors of `commands`, called with the first command
-    line, leave nerfstudio's own commands working.
+    Changes: `tyro.cli` in the namespace of nerfstudio's script, which loads the plugin before it builds the union of
+    its commands. For: ns-export. Without: `ns-export bitymi-atlas` and `bitymi-mesh` are unknown. Superfluous once
+    nerfstudio has a registry of exports. `commands` is called with the first command line.
     """
     main = sys.modules.get("__main__")
     as_main = str(getattr(main, "__file__", "") or "").replace("\\", "/").endswith("nerfstudio/scripts/exporter.py")
@@ -78,7 +77,7 @@ def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
             if f is getattr(module, "Commands", None):
                 try:
                     f = _with_members(f, commands())
-                except Exception as error:  # noqa: BLE001 - nerfstudio's own commands have to go on working
+                except Exception as error:  # noqa: BLE001 - nerfstudio's own commands go on working
                     cause = exit_messages.line_of(error) or error
                     warnings.warn(f"bitymi-ns: `ns-export {COMMAND}` is not available: {cause}", stacklevel=2)
             return tyro.cli(f, *args, **options)
@@ -87,7 +86,6 @@ def extend_exporter(commands: Callable[[], Sequence[Any]]) -> None:
 
 
 def _with_members(union: Any, more: Sequence[Any]) -> Any:
-    """Add members to a union; keep markers around it."""
     if get_origin(union) is Annotated:
         inner, *markers = get_args(union)
         return Annotated[(_with_members(inner, more), *markers)]
@@ -96,10 +94,10 @@ def _with_members(union: Any, more: Sequence[Any]) -> Any:
 
 
 def find_config() -> None:
-    """Take a folder's config.yml, and stop before nerfstudio loads what is no YAML, or of classes that are gone.
+    """Take a folder's config.yml, and refuse what is missing, a bundle without one, or of an early version.
 
-    Changes: --load-config in `sys.argv`, when the plugin is loaded. For: commands with that option but MESH_COMMAND,
-    which reads bundles without config.yml. Without: tracebacks. Superfluous once nerfstudio reports these.
+    Changes: --load-config in `sys.argv`. For: commands with that option but MESH_COMMAND, which reads bundles without
+    config.yml. Without: tracebacks. Superfluous once nerfstudio reports these.
     """
     i, path = _given_config()
     if path is None or MESH_COMMAND in sys.argv[1:2]:
@@ -107,12 +105,11 @@ def find_config() -> None:
     try:
         config, bundle = path / CONFIG if path.is_dir() else path, bundle_at(path)
         if bundle is not None and (bundle.is_file() or not (bundle / CONFIG).is_file()):
-            how = f"`bitymi unpack {bundle}` writes it as a folder with one; give that."
-            fail(f"{bundle} has no {CONFIG} for nerfstudio's commands: {how}")
+            fail(f"{bundle} has no {CONFIG} for nerfstudio: give the folder that `bitymi unpack {bundle}` writes.")
         if not config.is_file():
             fail(f"there is no {config}: give the {CONFIG} of a run (ns-train says where it is) or of a bundle.")
         if b"bitymi_ns.host." in config.read_bytes():
-            fail(f"{config} is of an early version, whose modules bitymi_ns.host are gone: train or export again.")
+            fail(f"{config} is of an early version that cannot be read any more: train or export again.")
     except OSError as error:
         fail(f"{exit_messages.line_of(error)}.", error)
     if config != path:
@@ -120,7 +117,7 @@ def find_config() -> None:
 
 
 def _given_config() -> tuple[int, Path | None]:
-    """Return the index in `sys.argv` and the path of --load-config on this process's command line; None without."""
+    """Return the index in `sys.argv` and the path of --load-config; None without."""
     for i, argument in enumerate(sys.argv):
         name, equals, value = argument.partition("=")
         if name in ("--load-config", "--load_config") and (equals or i + 1 < len(sys.argv)):
@@ -133,13 +130,16 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
 
     Changes: the answer of the trainer configuration's `get_checkpoint_dir`, for which eval_setup asks before it builds
     the pipeline; reads config.yml's path in eval_setup's frame, and options in the script's. For: ns-eval, ns-render,
-    ns-viewer, ns-export. Without: no moved run or bundle opens, nor one used from another folder, and commands that
-    cannot work end in tracebacks. Superfluous once eval_setup passes on the path that it loads.
+    ns-viewer, ns-export. Without: no moved run or bundle opens, and commands that cannot work end in tracebacks.
+    Superfluous once eval_setup passes on the path that it loads.
     """
-    model, evaluated, found = config.pipeline.model, _folder_being_evaluated(), _running_command()
+    model, evaluated, running = config.pipeline.model, _folder_being_evaluated(), _running_command()
+    command = None if running is None else running[0]
     if evaluated is not None:
         exit_messages.install()
-        refuse_others()
+        refused = _REFUSED.get(type(command).__name__)
+        if refused is not None:
+            fail(f"ns-export {refused}. {_MESH}")
         patch_viewer(config)
         patch_render()
         moved_capture(config.pipeline.datamanager)
@@ -149,11 +149,11 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
         datamanager = config.pipeline.datamanager
         data = datamanager.data or getattr(datamanager.dataparser, "data", None)
         if data is not None and not Path(data).exists() and has_cameras(model.bundle):  # its capture is gone
-            gray = found is not None and render.leave_out_photographs(found[0])
+            gray = render.leave_out_photographs(command)
             datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data), gray=gray)
             datamanager.data = model.bundle
         if evaluated is not None:  # no pickled data may lie in a bundle
-            measured = found is not None and type(found[0]).__name__ == "ComputePSNR"
+            measured = type(command).__name__ == "ComputePSNR"
             check = partial(check_same_capture, model.bundle) if measured else None
             hand_over(config, model.bundle / MANIFEST, {"step": 0, "pipeline": {}}, check)
         return model.bundle
@@ -161,7 +161,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     if evaluated is not None:
         if (evaluated / config.relative_model_dir).is_dir():
             folder, config.read_from = evaluated / config.relative_model_dir, evaluated
-        # a resumed run records the step it went on from
+        # a resumed run records the step that it went on from
         if config.load_step is None or not checkpoints.path_of(folder, config.load_step).is_file():
             config.load_step = checkpoints.newest_step(folder)
         path = checkpoints.path_of(folder, config.load_step)
@@ -173,9 +173,9 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
 def hand_over(ours: Any, path: Path, state: dict[str, Any], check: Callable[[Any], None] | None = None) -> None:
     """Have eval_setup load `state`, read from `path`, for the configuration `ours`, and `check` the pipeline.
 
-    Changes: `eval_load_checkpoint` in nerfstudio's eval_utils, once. For: ns-eval, ns-render, ns-viewer, ns-export.
-    Without: nerfstudio reads the file again by torch.load, which can run code of others, and no bundle opens.
-    Superfluous once eval_setup asks the method for its state.
+    Changes: `eval_load_checkpoint` in eval_utils, once. For: as above. Without: nerfstudio reads the file by
+    torch.load, which can run code of others, and no bundle opens. Superfluous once eval_setup asks the method for its
+    state.
     """
     from nerfstudio.utils import eval_utils
 
@@ -194,7 +194,7 @@ def hand_over(ours: Any, path: Path, state: dict[str, Any], check: Callable[[Any
 
 
 def _callers(depth: int = 1) -> list[FrameType]:
-    """Return the frames of the call stack outwards, from that `depth` calls above this one; 1 = the caller's."""
+    """Return the frames of the call stack outwards, from the one `depth` calls above this."""
     frame: FrameType | None = sys._getframe(depth)
     frames = []
     while frame is not None:
@@ -204,7 +204,7 @@ def _callers(depth: int = 1) -> list[FrameType]:
 
 
 def _folder_being_evaluated() -> Path | None:
-    """Find the folder of the config.yml that nerfstudio's eval_setup is loading; else None."""
+    """Find the folder of the config.yml that eval_setup is loading; else None."""
     for frame in _callers():
         if frame.f_code.co_name == "eval_setup" and isinstance(frame.f_locals.get("config_path"), Path):
             return frame.f_locals["config_path"].absolute().parent
@@ -212,7 +212,7 @@ def _folder_being_evaluated() -> Path | None:
 
 
 def _running_command() -> tuple[Any, dict[str, Any]] | None:
-    """Find the script object whose main function is loading a scene, and its module's namespace; else None."""
+    """Find the script object whose `main` is running, and its module's namespace; else None."""
     for frame in _callers():
         command = frame.f_locals.get("self")
         if frame.f_code.co_name == "main" and type(command).__module__.startswith(("nerfstudio.scripts.", "__main__")):
@@ -231,22 +231,11 @@ def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
     fail(f"no bundle found ({MANIFEST} is not in {tried}). Keep config.yml in the bundle's folder.")
 
 
-def refuse_others() -> None:
-    """Stop a command that cannot work on a scene before loading it.
-
-    Changes: nothing. For: commands of ns-export that need rays. Without: they fail halfway with tracebacks. Superfluous
-    once methods state which exports they support.
-    """
-    found = _running_command()
-    if found is not None and type(found[0]).__name__ in REFUSED:
-        fail(REFUSED[type(found[0]).__name__])
-
-
 def moved_capture(datamanager: Any) -> None:
     """Read the capture at the environment variable `DATA`, if it is set.
 
-    Changes: the recorded path. For: ns-eval, ns-render, ns-viewer, ns-export. Without: runs and bundles are lost with
-    their capture's folder. Superfluous once these have an option --data.
+    Changes: the recorded path. For: as above. Without: runs and bundles are lost when their capture moves. Superfluous
+    once these commands have an option --data.
     """
     if not os.environ.get(DATA):
         return
@@ -261,8 +250,7 @@ def patch_viewer(config: Any) -> None:
 
     Changes: `_start_viewer` in nerfstudio's script, for this scene. For: ns-viewer. Without: the viewer is open to the
     network, as its command line replaces the recorded host; Ctrl-C ends in a traceback; bundles of lost photographs
-    cannot be shown. Superfluous once ns-viewer keeps recorded options, listens on this machine alone, and catches
-    Ctrl-C.
+    cannot be shown. Superfluous once ns-viewer does these.
     """
     script: Any
     for script in map(sys.modules.get, (VIEWER, "__main__")):
@@ -274,7 +262,7 @@ def _start_viewer(ours: Any, start: Callable[..., None], config: Any, *args: Any
     if config is not ours:
         start(config, *args)
         return
-    for pipeline in args[:1]:  # photographs may be missing
+    for pipeline in args[:1]:
         for name in ("train_dataset", "eval_dataset"):
             dataset = getattr(getattr(pipeline, "datamanager", None), name, None)
             if dataset is not None:
@@ -293,14 +281,14 @@ def patch_render() -> None:
     """Have ns-render or ns-eval check their options before loading the scene, and write whole results by this package.
     Raises InputError: an option or the camera path cannot be used.
 
-    Changes: functions in the script's namespace that render and write, until it has rendered; ns-eval's output path.
-    For: ns-render, ns-eval. Without: films need a program ffmpeg, spirals roll, principal points are ignored, options
-    are checked after loading the scene, and a full disk leaves half a file. Superfluous once nerfstudio does these.
+    Changes: functions of the script that render and write, until it has rendered; ns-eval's output path. For:
+    ns-render, ns-eval. Without: films need the program ffmpeg, spirals roll, principal points are ignored, options are
+    checked after loading, and a full disk leaves half a file. Superfluous once nerfstudio does these.
     """
-    found = _running_command()
-    if found is None:
+    running = _running_command()
+    if running is None:
         return
-    command, script = found
+    command, script = running
     kind = type(command).__name__
     if kind in (*render.TRAJECTORIES, "DatasetRender"):
         render.check_options(command)
@@ -341,7 +329,7 @@ def patch_render() -> None:
 def print_brackets() -> Iterator[None]:
     """Have nerfstudio's console print a line whose brackets are no markup as it is.
 
-    Changes: `print` and `log` of the console, for a while. For: ns-train. Without: a bracket in a path ends the run.
+    Changes: `print` and `log` of the console in the block. For: ns-train. Without: a bracket in a path ends the run.
     Superfluous once nerfstudio escapes what it prints.
     """
     stock = {name: getattr(CONSOLE, name) for name in ("print", "log")}

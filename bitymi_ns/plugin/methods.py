@@ -1,5 +1,5 @@
-"""Entry points of nerfstudio's method registry (pyproject.toml). Every ns-* command loads them and handles no errors,
-so nothing here raises: a method that fails to load reports why when it is used."""
+"""Entry points of nerfstudio's method registry. Every ns-* command loads them and handles no errors, so nothing here
+raises: a method that fails to load reports why when it is used."""
 
 import functools
 import warnings
@@ -15,7 +15,7 @@ from bitymi_ns.errors import KernelsUnavailable
 
 @dataclass
 class UnavailableConfig(TrainerConfig):
-    """Stand-in for a method that failed to load, which reports the reason when used."""
+    """Stand-in for a method that failed to load."""
 
     reason: str = ""
 
@@ -37,7 +37,7 @@ def _specification(name: str) -> MethodSpecification:
 
 
 def _install() -> None:
-    """Make the changes that nerfstudio's registry has no place for, each even if another fails; see `hooks`."""
+    """Make the changes of `hooks`, each even if another fails."""
     try:
         from . import hooks
         from .run import torchrun
@@ -76,7 +76,7 @@ def _exports() -> list[Any]:
 
 
 def __getattr__(name: str) -> MethodSpecification:
-    """Make the registry entry of the preset `name`, with - for _: one of the entry points, or a user's own."""
+    """Make the registry entry of the preset `name`, with - for _."""
     if name.startswith("_"):
         raise AttributeError(name)
     return _specification(name.replace("_", "-"))

@@ -65,7 +65,7 @@ def test_bundles_without_cameras_make_no_mesh(copied: Path, tmp_path: Path) -> N
     info = read_bundle(copied).info
     del info.files["cameras.json"]
     (copied / "bundle.json").write_bytes(dump(info))
-    with pytest.raises(InputError, match=r"has no cameras \(cameras.json\) .*give the config.yml of the run"):
+    with pytest.raises(InputError, match=r"has no cameras \(cameras.json\): give the config.yml of the run"):
         ExportMesh(load_config=copied / "config.yml", output_dir=tmp_path / "mesh").main()
     assert not (tmp_path / "mesh").exists()
 
@@ -76,16 +76,16 @@ def test_commands_name_the_command(packed: Path, copied: Path, command: list[str
     find_config()
     text = (copied / "config.yml").read_text()
     (copied / "config.yml").write_text(text.replace("bitymi_ns.plugin.run.", "bitymi_ns.host."))
-    with pytest.raises(InputError, match="config.yml is of an early version, whose modules bitymi_ns.host are gone"):
+    with pytest.raises(InputError, match="config.yml is of an early version"):
         find_config()
     (copied / "config.yml").unlink()
     for given in (packed, packed / "config.yml", copied / "config.yml"):
         monkeypatch.setattr(sys, "argv", [*command, f"--load-config={given}"])
-        with pytest.raises(InputError, match="has no config.yml for nerfstudio's commands: `bitymi unpack "):
+        with pytest.raises(InputError, match="has no config.yml for nerfstudio: .*`bitymi unpack "):
             find_config()
         monkeypatch.setattr(sys, "argv", ["ns-export", "bitymi-mesh", "--load-config", str(given)])
         find_config()
-    with pytest.raises(InputError, match="that of a bundle, which is baked already"):
+    with pytest.raises(InputError, match="is a bundle's"):
         load_trained(packed)
 
 

@@ -78,7 +78,7 @@ def test_a_folder_takes_one_run_at_a_time(start: Start) -> None:
 def test_too_little_room_for_a_checkpoint_is_found_first(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(folder_lock.files, "free_bytes", lambda path: 12_000)
     config = start(name="full")
-    with pytest.raises(InputError, match=r"has 12.0 kB free, and a checkpoint takes [\d.]+ [kM]B already at the start"):
+    with pytest.raises(InputError, match=r"has 12.0 kB free, and a checkpoint takes [\d.]+ [kM]B or more"):
         ns_train.main(config)
     assert not (config.get_base_dir() / "nerfstudio_models").exists()
 
@@ -95,7 +95,7 @@ def test_a_folder_that_cannot_be_written(start: Start) -> None:
 def test_a_new_run_keeps_out_of_the_folder_of_an_earlier_one(trained: BitymiTrainerConfig, start: Start) -> None:
     config = start(name="run")
     config.output_dir = trained.output_dir
-    with pytest.raises(InputError, match="holds a run already, its newest checkpoint is step-0+59.ckpt.*--load-dir"):
+    with pytest.raises(InputError, match="holds a run, up to step-0+59.ckpt.*--load-dir"):
         ns_train.main(config)
     assert len(list(trained.get_checkpoint_dir().glob("*.ckpt"))) == 3
 

@@ -92,7 +92,7 @@ def test_a_gpu_gets_the_full_run_and_a_cpu_a_short_one(
     assert ("on the CPU instead of cuda: the card is too old" in capsys.readouterr().out) is (problem is not None)
     if problem is not None:
         assert run.machine.device_type == "cpu" and run.steps_per_save == 600
-        assert "3,000 steps on cpu, the short schedule" in run.length()
+        assert "3,000 steps on cpu, a short run" in run.length()
 
 
 def test_a_given_length_is_kept_where_it_makes_sense() -> None:

@@ -1,4 +1,4 @@
-"""Convert nerfstudio's cameras to the renderer's, check them, and convert depth and normals for nerfstudio's tools."""
+"""Convert nerfstudio's cameras, and check them; convert depth and normals for its tools."""
 
 import math
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ POSSIBLE_VIEW = (0.01, 178.0)  # view angles of accepted focal lengths, degrees
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
-    """Convert one of nerfstudio's cameras (OpenGL axes: x right, y up, z backward) to world-to-camera in OpenCV axes.
-    Raises InputError: it is not a perspective camera, or has distortion."""
+    """Convert one of nerfstudio's cameras (OpenGL axes: x right, y up, z backward) to OpenCV axes. Raises InputError:
+    it is not a perspective camera, or has distortion."""
     cameras = cameras.reshape((-1,))
     if cameras.shape[0] != 1:
         raise ValueError(f"expected one camera, found {cameras.shape[0]}")
@@ -29,8 +29,7 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
     if int(kind) != CameraType.PERSPECTIVE.value:
         fail(f"cameras of type {CameraType(int(kind)).name.lower()} cannot be rendered; only perspective cameras can")
     if bool((row[19:] != 0).any()):
-        why = "a camera has lens distortion, which this method does not render"
-        fail(f"{why}. For tools that do not undistort, undistort the capture first (COLMAP's image_undistorter).")
+        fail("a camera has lens distortion: undistort the capture first (COLMAP's image_undistorter).")
     c2w = row[7:19].view(3, 4)
     rotation = c2w[:, :3] * c2w.new_tensor([1.0, -1.0, -1.0])
     viewmat = torch.eye(4, dtype=torch.float64)
@@ -41,7 +40,6 @@ def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Cam
 
 
 def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> list[Camera]:
-    """Convert nerfstudio's cameras [N]; see `to_camera`."""
     return [to_camera(cameras[i : i + 1], device) for i in range(len(cameras))]
 
 
@@ -78,8 +76,8 @@ def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
 
 
 def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
-    """Convert blended depth [H, W, 1], the sum of w z with z in the camera frame, and alpha [H, W, 1], the sum of w, to
-    nerfstudio's depth [H, W, 1], the expected distance along each pixel's ray; empty pixels get the largest one."""
+    """Convert blended depth [H, W, 1], the sum of w z, and alpha [H, W, 1], the sum of w, to nerfstudio's depth [H, W,
+    1], the expected distance along the ray; empty pixels get the largest one."""
     height, width = depth.shape[:2]
     x = (torch.arange(width, device=depth.device) + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     y = (torch.arange(height, device=depth.device) + 0.5 - camera.K[1, 2]) / camera.K[1, 1]
@@ -89,7 +87,7 @@ def ray_distance(depth: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
 
 
 def normal_image(normal: Tensor, camera: Camera) -> Tensor:
-    """Convert blended camera-frame normals [H, W, 3] to colors (n + 1) / 2 of the world normal; 0 in empty pixels."""
+    """Convert blended camera-frame normals [H, W, 3] to colors (n + 1) / 2 of world normals; 0 in empty pixels."""
     length = normal.norm(dim=-1, keepdim=True)
     unit = normal / length.clamp(min=1e-6)
     # R^T n without a matrix product, which cuBLAS refuses to deterministic algorithms

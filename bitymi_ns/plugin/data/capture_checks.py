@@ -1,4 +1,4 @@
-"""Check a capture before time is spent on it, and report errors of nerfstudio's loaders in plain words."""
+"""Check a capture before time is spent on it, and report errors of nerfstudio's loaders."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -40,7 +40,7 @@ STOCK_IGNORED = ("_target", "depths_path", "max_2D_matches_per_3D_point",
 
 
 def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
-    """Translate one of nerfstudio's parsers to `bitymi-data`, unless that lacks its format or an option that is set."""
+    """Translate one of nerfstudio's parsers to `bitymi-data`, if that has its format and the options that are set."""
     format = STOCK_FORMATS.get(type(config))
     if format is None:
         return config
@@ -61,8 +61,8 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
 
 @as_input_error()
 def check_capture(config: FullImageDatamanagerConfig, trains: bool = True) -> None:
-    """Check that there is a capture at the data manager's path, and prepare its parser; `trains`: with points to start
-    from. Raises InputError: there is none, or an option is out of range."""
+    """Check that there is a capture at the data manager's path, and prepare its parser; `trains`: with points. Raises
+    InputError: there is none, or an option is out of range."""
     config.dataparser = dataparser = bitymi_parser(config.dataparser)
     data = Path(config.data if config.data is not None else dataparser.data)
     if not data.exists():
@@ -76,7 +76,7 @@ def check_capture(config: FullImageDatamanagerConfig, trains: bool = True) -> No
 
 @as_input_error()
 def read_early(config: FullImageDatamanagerConfig) -> Capture | None:
-    """Read a checked capture for a training if it comes with poses; else None. Raises InputError: it cannot be used."""
+    """Read a checked capture for a training if it comes with poses; else None."""
     if not isinstance(config.dataparser, BitymiDataParserConfig):
         return None
     parser = config.dataparser.prepare(points=True)
@@ -88,7 +88,7 @@ def read_early(config: FullImageDatamanagerConfig) -> Capture | None:
 
 
 def declares_box(dataparser: DataParserConfig) -> bool:
-    """Test if a capture that nerfstudio's parser reads states the box of its scene; other parsers' are defaults."""
+    """Test if a capture that nerfstudio's parser reads states its scene's box; else that is a default."""
     if isinstance(dataparser, InstantNGPDataParserConfig):
         path = dataparser.data if dataparser.data.suffix == ".json" else dataparser.data / "transforms.json"
         return "aabb_scale" in read_json(path)
@@ -102,8 +102,7 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        what = f"nerfstudio's reader of this capture cannot be loaded: {error}"
-        fail(f"{what}. Install the module with pip, or the library (lib....so) with the system's packages.", error)
+        fail(f"nerfstudio's reader of this capture cannot be loaded: {error}. Install the module or library.", error)
     except Image.DecompressionBombError as error:  # nerfstudio opens photographs before they are checked
         fail(f"{capture} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller", error)
     except (CaptureError, NameError, AssertionError):  # clear already, or no fault of the capture

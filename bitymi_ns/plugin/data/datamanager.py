@@ -57,14 +57,12 @@ else:
 
 @dataclass
 class BitymiDataManagerConfig(FullImageDatamanagerConfig):
-    """Configuration of the data manager."""
-
     _target: type = field(default_factory=lambda: BitymiDataManager)
     dataparser: AnyDataParser = field(default_factory=NerfstudioDataParserConfig)  # Parser of the capture.
     cache_images_type: Literal["uint8", "float32"] = "uint8"
-    """Type of the images in memory; uint8 takes a quarter of the space."""
+    """Type of the images in memory."""
     longest_side: int = LONGEST_SIDE
-    """Downscale photographs to this many pixels along a side as they are read; 0 = use them as they are."""
+    """Downscale photographs to this many pixels along a side as they are read; 0 = not at all."""
     train_cameras_sampling_seed: int = 42  # Seed of the order of training views.
     # nerfstudio's options without effect here are left out of the help
     train_cameras_sampling_strategy: tyro.conf.Suppress[Literal["random", "fps"]] = "random"
@@ -78,8 +76,8 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
 
 
 class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
-    """Full images and their cameras. The view of a training step is a function of seed and step alone, so that resumed
-    runs see the views of uninterrupted ones: each epoch of n steps permutes the n views."""
+    """Full images and their cameras. A step's view is a function of seed and step alone, so that resumed runs see the
+    views of uninterrupted ones."""
 
     config: BitymiDataManagerConfig
 
@@ -115,19 +113,19 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return test_mode != "inference" and not CaptureFacts.of(self.train_dataparser_outputs.metadata).lost
 
     def get_datapath(self) -> Path:
-        """Return the viewer's folder of camera paths: the capture's, or the bundle's if that is gone."""
+        """Return the viewer's folder of camera paths: the capture's, or beside the bundle if that is gone."""
         path = Path(super().get_datapath())
         return path.parent if isinstance(self.config.dataparser, BundleCamerasConfig) else path
 
     def sample_train_cameras(self) -> list[int]:
-        """Return the training views for nerfstudio's base class; `train_index` orders them."""
+        """Return all training views; `train_index` orders them."""
         if len(self.train_dataset) == 0:
-            which = f"no image is left for training in {self.config.data}: all {len(self.eval_dataset)} are held out"
-            fail(f"{which}. Take more photographs, or train on all of them with `bitymi-data --eval-mode all`.")
+            held_out = f"all {len(self.eval_dataset)} photographs of {self.config.data} are held out"
+            fail(f"{held_out}. Take more, or train on all of them with `bitymi-data --eval-mode all`.")
         return list(range(len(self.train_dataset)))
 
     def _check_images(self, test_mode: str) -> None:
-        """Fail or warn if no scene can be learned from the capture, before time is spent."""
+        """Fail or warn if no scene can be learned from the capture."""
         if not self._has_photos(test_mode):
             return
         count, datasets = len(self.train_dataset), (self.train_dataset, self.eval_dataset)
@@ -141,7 +139,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if count == 1 and test_mode == "val":
             fail(f"only one training view in {self.config.data}: take photographs from more sides.")
         if count < FEW_VIEWS and test_mode == "val":
-            warn(f"Only {count} training views: views from elsewhere will look poor. Take twenty or more photographs.")
+            warn(f"Only {count} training views: others will look poor. Take twenty or more photographs.")
 
     def _check_points(self) -> None:
         """Warn if points have no colors, or another unit than the poses."""
@@ -193,7 +191,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return MemoryBudget(photograph_bytes(torch.device(self.device), self.world_size))
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]) -> CachedImages:
-        """Cache a split in host memory; a run decides what is on the GPU (`DownscaledViews`)."""
+        """Cache a split in host memory."""
         dataset = self.train_dataset if split == "train" else self.eval_dataset
         with reporting_input_errors(self.config):
             return CachedImages(dataset, self.config.cache_images_type, self._budget, f"Reading the {split} images")
@@ -210,7 +208,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def eval_dataloader(self) -> SimpleNamespace:
-        """Loader that gives `ns-render spiral` its first camera: a held-out view's, else a training view's."""
+        """Loader that gives `ns-render spiral` its first camera."""
         cameras = (self.eval_dataset if len(self.eval_dataset) else self.train_dataset).cameras
         return SimpleNamespace(get_camera=lambda image_idx: (cameras[image_idx : image_idx + 1], {}))
 
@@ -220,7 +218,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, number)
 
     def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """Return camera and batch of a step's training view at full size; training asks `train_index` alone."""
         return self.train_view(self.train_index(step))
 
     @property
@@ -230,12 +227,11 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
 
     @property
     def eval_views(self) -> OnDemand[View]:
-        """Held-out views likewise."""
         return self._views(self.eval_dataset, lambda i: self.cached_eval[i])
 
     def move_cameras(self, motions: Tensor) -> Callable[[Camera], Camera] | None:
-        """Apply the pose corrections of a run, motions [V, 6] of `Poses`, to the training views' cameras; return the
-        function that carries other cameras along, or None if the motions are of other photographs."""
+        """Apply a run's pose corrections, motions [V, 6] of `Poses`, to the training cameras; return the function that
+        carries other cameras along, or None if the motions are of other photographs."""
         cameras = self.train_dataset.cameras
         if len(motions) != len(cameras):
             return None
@@ -253,7 +249,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return [[exposure.at(file) for file in files] for files in (train, held_out)]
 
     def corrected_eval_views(self, state: Mapping[str, Any] | None) -> OnDemand[View]:
-        """Return the held-out views with their color corrections, by the state of a run's `Exposure`."""
+        """Return the held-out views with their color corrections."""
         views, (_, held_out) = self.eval_views, self.corrections(state)
         return OnDemand(len(views), lambda i: views[i]._replace(correction=held_out[i]))
 
@@ -270,16 +266,15 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return OnDemand(len(dataset), view)
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        """Return the held-out views in turn, without a shared random generator."""
+        """Return the held-out views in turn."""
         return self.eval_view(step % len(self.eval_dataset))
 
     def train_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """Return camera and batch of a training view without effect on the order."""
+        """Return camera and batch of a training view."""
         data = self._batch(self.cached_train[index])
         return self.train_dataset.cameras[index : index + 1].to(self.device), data
 
     def eval_view(self, index: int) -> tuple[Cameras, dict[str, Any]]:
-        """Return camera and batch of a held-out view."""
         return self.eval_dataset.cameras[index : index + 1].to(self.device), self._batch(self.cached_eval[index])
 
     def _batch(self, cached: dict[str, Any]) -> dict[str, Any]:

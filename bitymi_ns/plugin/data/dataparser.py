@@ -37,7 +37,7 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
     """Color behind the transparent pictures of a Blender data set; None = that of the method."""
     depth: DepthKind = "auto"
     """Depth of the photographs: metric = one scale for all; relative = scale and shift of each, fitted to the points;
-    auto = the one that agrees with the points; off = use neither depth nor normals."""
+    auto = the one that agrees with the points; off = neither depth nor normals."""
     depth_unit_scale_factor: float | None = None
     """Metres per unit of depth; None = 0.001 for integers, 1 for floating-point numbers."""
     poses: tyro.conf.Suppress[Path | None] = None
@@ -45,9 +45,8 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
     _parser: "BitymiDataParser | None" = field(default=None, init=False, repr=False, compare=False)
 
     def prepare(self, points: bool) -> "BitymiDataParser":
-        """Make the parser that the next `setup` returns, unless there is one: nerfstudio calls that without arguments,
-        and a training reads its capture once, before its first file is written. `points`: read the points, too, for a
-        scene that starts from them; evaluation and the viewer skip them."""
+        """Make the parser that the next `setup` returns, unless there is one: a training reads its capture once, before
+        its first file is written. `points`: read the points, too, for a scene that starts from them."""
         if self._parser is None or self._parser.points != points:
             self._parser = BitymiDataParser(self, points)
         return self._parser
@@ -57,7 +56,7 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
         return parser
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the options, for config.yml, copies and other processes."""
+        """Return the options, for config.yml and copies."""
         return {name: value for name, value in vars(self).items() if name != "_parser"}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -66,13 +65,11 @@ class BitymiDataParserConfig(CaptureOptions, DataParserConfig):
 
     @as_input_error()
     def resolve_names(self) -> None:
-        """Replace a file in `eval_names` by the names that it holds, so that config.yml needs no other file."""
+        """Replace a file in `eval_names` by the names that it holds."""
         self.eval_names = splits.read_names(self.eval_names)
 
 
 class BitymiDataParser(DataParser):
-    """Views of a capture in any format."""
-
     config: BitymiDataParserConfig
 
     def __init__(self, config: BitymiDataParserConfig, points: bool = False) -> None:
@@ -83,12 +80,10 @@ class BitymiDataParser(DataParser):
     @cached_property
     @as_input_error()
     def found(self) -> Found:
-        """Recognize the capture, once."""
         return self.config.find()
 
     @cached_property
     def capture(self) -> Capture:
-        """The capture; read once."""
         return read_capture(self.config, self.downscale_factor is None, self.points, self.found)
 
     @cached_property
@@ -104,8 +99,6 @@ class BitymiDataParser(DataParser):
 
 @dataclass
 class BundleCamerasConfig(DataParserConfig):
-    """Cameras of a bundle."""
-
     _target: type = field(default_factory=lambda: BundleCameras)
     data: Path = Path()  # Folder of the bundle.
     capture: Path = Path()  # Folder of the lost capture.

@@ -1,4 +1,4 @@
-"""Dataset of a capture: undistorted images with alpha and masks, cached in memory within a budget."""
+"""Dataset of a capture: undistorted images with alpha and masks, cached in memory."""
 
 import hashlib
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from .facts import CaptureFacts
 from .views import MOVED, select_views
 
 PHOTOGRAPH_BYTES = 1 << 28
-"""Memory for the images of a capture in a run on the CPU, where a step takes far longer than reading one."""
+"""Memory for a capture's images in a run on the CPU, where a step takes far longer than reading one."""
 PREFETCH = 4  # images that are read together at the start
 RECENT = 2  # last images beyond the budget that stay cached: a step asks for a view more than once
 POSE_STEP = 1e-4  # resolution of compared poses, in units of the scene
@@ -47,7 +47,6 @@ class BitymiDataset(InputDataset):
 
     @property
     def facts(self) -> CaptureFacts:
-        """Facts of the capture and of each view."""
         return CaptureFacts.of(self.metadata)
 
     @as_input_error()
@@ -71,13 +70,12 @@ class BitymiDataset(InputDataset):
         return pixels
 
     def summary(self, image_idx: int) -> ImageSummary:
-        """Return the summary of an image, reading it if necessary."""
         if image_idx not in self._summaries:
             self.get_numpy_image(image_idx)
         return self._summaries[image_idx]
 
     def __getitem__(self, image_idx: int) -> dict[str, Any]:
-        """Return the batch for viewer and ns-render, which need composed alpha."""
+        """Return the batch for viewer and ns-render, with composed alpha."""
         data = self.get_data(image_idx)
         color = self._dataparser_outputs.alpha_color
         data["image"] = over_background(data["image"], None if color is None else torch.as_tensor(color).float())
@@ -85,8 +83,8 @@ class BitymiDataset(InputDataset):
 
     @as_input_error()
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict[str, Any]:
-        """Read an image [H, W, 3 or 4], alpha not composed, its mask [H, W, 1] bool if any, and in training its depth
-        [H, W] in units of the scene and normal [H, W, 3], both float16, if they are used."""
+        """Read an image [H, W, 3 or 4], alpha not composed, its mask [H, W, 1] bool if any, and, if used, its depth [H,
+        W] in units of the scene and normal [H, W, 3], both float16."""
         image = torch.from_numpy(self.get_numpy_image(image_idx))
         image = image.float() / 255.0 if image_type == "float32" else image
         data: dict[str, Any] = {"image_idx": image_idx, "image": image}
@@ -115,23 +113,23 @@ class BitymiDataset(InputDataset):
 
 
 def photograph_bytes(device: torch.device, processes: int = 1) -> int:
-    """Return the bytes of host memory for a capture's images in each process of a run. On GPUs the processes share half
-    of what is available, as a step takes less time than reading a photograph."""
+    """Return the bytes of host memory for images in each of a run's processes. On GPUs they share half of what is
+    available, as a step takes less time than reading a photograph."""
     if device.type == "cpu":
         return PHOTOGRAPH_BYTES
     return max(PHOTOGRAPH_BYTES, int(min(psutil.virtual_memory().available, memory_limit()) / (2 * processes)))
 
 
 def view_mask(outputs: DataparserOutputs, index: int) -> Image.Image:
-    """Read the mask of a view whose photograph has one, or does not cover the view."""
+    """Read the mask of a view, if its photograph has one or does not cover it."""
     path = None if outputs.mask_filenames is None else outputs.mask_filenames[index]
     lens = CaptureFacts.of(outputs.metadata).lenses[index]
     return lens.undistort_mask(None if path is None else checked_mask(path), path)
 
 
 class CachedImages(OnDemand[dict[str, Any]]):
-    """Batches of a dataset (image, mask, metadata), kept within the budget, which datasets share, and read at every use
-    beyond it. Reads all at the start, to notice unreadable ones."""
+    """Batches of a dataset, kept within the budget, which datasets share, and read at every use beyond it. Reads all at
+    the start, to notice unreadable ones."""
 
     def __init__(
         self, dataset: BitymiDataset, image_type: Literal["uint8", "float32"], budget: MemoryBudget, description: str
@@ -159,9 +157,9 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
     if not blank:
         return outputs
     which = f"{len(masks)} {split} photographs exclude every pixel"
-    named = listed([outputs.image_filenames[i] for i in blank])
     if split == "training" and len(blank) == len(masks):
-        fail(f"the masks of all {which}: {named}. Pixels count where the mask is not black: invert inverted masks.")
+        fail(f"the masks of all {which}. Pixels count where the mask is not black: invert inverted masks.")
+    named = listed([outputs.image_filenames[i] for i in blank])
     warn(f"The masks of {len(blank)} of {which}: {named}. These views are left out.")
     return select_views(outputs, [i for i in range(len(masks)) if i not in blank])
 
@@ -175,7 +173,7 @@ def capture_fingerprint(dataset: BitymiDataset) -> dict[str, Any]:
 
 
 def warn_of_other_capture(before: Mapping[str, Any] | None, now: Mapping[str, Any]) -> None:
-    """Warn if a run that is resumed, measured or exported reads another capture, by fingerprints (None = unknown)."""
+    """Warn if a run that is resumed, measured or exported reads another capture, by fingerprints."""
     if before is None:
         return
     if before["views"] != now["views"]:
@@ -186,5 +184,4 @@ def warn_of_other_capture(before: Mapping[str, Any] | None, now: Mapping[str, An
         what = "its cameras stand elsewhere"
     else:
         return
-    then = "Photographs that are held out now may have been trained on. Where that matters, train a new run."
-    warn(f"The run was trained on another capture: {what}. {then}")
+    warn(f"The run was trained on another capture: {what}. What is held out now may have been trained on.")

@@ -1,4 +1,4 @@
-"""Fit depth maps of the training photographs to the scene, by points and other photographs, and make initial points."""
+"""Fit depth maps of the training photographs to the scene, and make initial points."""
 
 from __future__ import annotations
 
@@ -21,15 +21,14 @@ from bitymi_ns.ranges import spread
 from .facts import KEY, CaptureFacts, DepthFit, FittedMaps
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
-"""metric = one scale for all maps; relative = scale and shift of each; auto = by agreement with the points; off =
-unused."""
+"""See `BitymiDataParserConfig.depth`."""
 SIDE = 320  # longest side of compared maps, pixels
 TOLERANCE = 0.05  # relative difference of depths of one surface
 FEW_PAIRS = 20  # fewest points in a photograph to fit scale and shift of its depth
 AGREES = 0.25  # least share of agreeing points for usable depth; hidden points disagree
 AGREE_MUTUALLY = 0.45
 """Least ratio, for usable depth, of pixels that another photograph confirms to those that it confirms or sees through.
-Sample room: 0.95; with noise of 5 % 0.57; with the unit wrong by a factor of 0.001 to 1,000 at most 0.39."""
+Measured: 0.95; with noise of 5 % 0.57; with the unit wrong by a factor of 0.001 to 1,000 at most 0.39."""
 BETTER = 0.15  # least gain in agreeing points, as a share, for relative depth
 TRIALS = 200  # pairs of points for scale and shift
 SEEN_BY = 16  # photographs compared with a new point
@@ -100,9 +99,10 @@ def _check_normals(facts: CaptureFacts) -> None:
         normal = read_normal(files, lens)
         away = ((normal * lens.pinhole.rays).sum(-1) > 0.0)[normal.any(-1)]
         if len(away) and away.mean() > 0.2:
-            what = f"{away.mean():.0%} of the normals of {files.normal} face away from the camera"
-            frame = "they are not in its frame (x right, y up, z back)"
-            warn(f"{what}: {frame}. Correct them, or train without: `bitymi-data --depth off`.")
+            warn(
+                f"{away.mean():.0%} of the normals of {files.normal} face away from the camera (x right, "
+                "y up, z back): correct them, or train without: `bitymi-data --depth off`."
+            )
             return
 
 
@@ -125,7 +125,7 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> Sequence[DepthFit | None] | None:
-    """Fit each map to points [N, 3]; few = metric, of `unit` scene units per metre. None = depth is unused."""
+    """Fit each map to points [N, 3]; few = metric, of `unit` scene units per metre. None = unused."""
     if not any(each.values.any() for each in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None
@@ -133,11 +133,11 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> S
     values, z = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
     if len(z) < FEW_PAIRS:
         if kind == "relative":
-            warn("Relative depth needs points of the scene, and there are none in the pictures: depth is not used.")
+            warn("Relative depth needs points of the scene in the pictures: depth is not used.")
             return None
         agreement = _agreement([view.fitted(DepthFit(unit)) for view in seen])
         if agreement is not None and agreement < AGREE_MUTUALLY:
-            what = f"The depth maps agree with each other in {agreement:.0%} of their pixels by the poses"
+            what = f"By the poses, the depth maps agree in {agreement:.0%} of their pixels"
             warn(f"{what}: depth is not used. Its unit may be another (`bitymi-data --depth-unit-scale-factor`).")
             return None
         say(f"Depth of {len(seen)} photographs is used as metric.")
@@ -154,7 +154,7 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> S
     use_relative = kind == "relative" or (kind == "auto" and share > metric + BETTER)
     if (share if use_relative else metric) < AGREES:
         how = "with scale and shift fitted to each" if use_relative else "with one scale for all"
-        what = f"The depth maps agree with {max(share, metric):.0%} of the points in the pictures, {how}"
+        what = f"The depth maps agree with {max(share, metric):.0%} of the points, {how}"
         warn(f"{what}: depth is not used. They may be of other photographs, or not of camera z.")
         return None
     if use_relative:
@@ -177,7 +177,7 @@ def _pairs(view: _Seen, xyz: Floats) -> tuple[Floats, Floats]:
 
 
 def _mode(ratios: Floats) -> float:
-    """Find the most frequent ratio: occluded points have larger ones."""
+    """Find the most frequent ratio; occluded points have larger ones."""
     logs = np.sort(np.log(ratios))
     width = np.searchsorted(logs, logs + 2 * TOLERANCE) - np.arange(len(logs))
     start = int(width.argmax())
@@ -185,7 +185,7 @@ def _mode(ratios: Floats) -> float:
 
 
 def _affine(values: Floats, z: Floats, inverse: bool) -> tuple[DepthFit | None, float]:
-    """Fit scale and shift of a map by the largest set of agreeing points; return their share, too."""
+    """Fit scale and shift of a map by the largest set of agreeing points; return it with their share."""
     if len(z) < FEW_PAIRS:
         return None, 0.0
     target = 1.0 / z if inverse else z
@@ -242,7 +242,7 @@ def _votes(xyz: Floats, own: int, seen: Sequence[_Seen]) -> npt.NDArray[np.int64
 
 def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tuple[Floats, npt.NDArray[np.uint8]]:
     """Sample at most `count` points [N, 3] with colors [N, 3] from the maps, weighted by 1 / (number of views that show
-    a point); leave out points that more views see through than agree with."""
+    a point), without those that more views see through than agree with."""
     if count < 1 or not seen:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     rng = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Carry what is known of a capture beside nerfstudio's fields, in one record, from the reader to the model."""
+"""What is known of a capture beside nerfstudio's fields, in one record, from the reader to the model."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ class FittedMaps(NamedTuple):
     unit: float | None
 
     def read(self, lens: Lens) -> dict[str, Values]:
-        """Read depth [H, W] and normal [H, W, 3] if they are used, see `View`."""
+        """Read depth [H, W] and normal [H, W, 3], if they are used."""
         depth = {} if self.fit is None else {"depth": self.fit.z(read_depth(self.files, lens, self.unit))}
         return depth if self.files.normal is None else {**depth, "normal": read_normal(self.files, lens)}
 
 
 @dataclass(frozen=True)
 class CaptureFacts:
-    """Facts of a capture: of views and poses by its parser, then of the training views by the data manager."""
+    """Facts of a capture: of views and poses by its parser, of the training views by the data manager."""
 
     lenses: Sequence[Lens] = ()  # of each view
     files: Sequence[Path] = ()  # photograph of each view, which views may share
@@ -73,7 +73,7 @@ class CaptureFacts:
 
     @staticmethod
     def of(metadata: Mapping[str, Any]) -> CaptureFacts:
-        """Return the record in nerfstudio's metadata; an empty one without."""
+        """Return the record in nerfstudio's metadata, or an empty one."""
         return metadata.get(KEY) or CaptureFacts()
 
     def select(self, indices: Sequence[int]) -> CaptureFacts:
@@ -81,5 +81,5 @@ class CaptureFacts:
         return replace(self, **{name: [values[i] for i in indices] for name, values in per_view.items() if values})
 
     def __deepcopy__(self, memo: object) -> CaptureFacts:
-        """Return the record itself: nerfstudio's data sets copy the metadata."""
+        """Return the record itself: nerfstudio copies the metadata."""
         return self

@@ -29,19 +29,18 @@ class Views(DataparserOutputs):
     """DataparserOutputs with a float64 dataparser_transform: captures may lie millions of units from the origin."""
 
     def transform_poses_to_original_space(self, poses: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
-        """Call nerfstudio's method in float64."""
         return super().transform_poses_to_original_space(poses.double(), *args, **kwargs)
 
 
 def make_views(
     capture: Capture, need_photos: bool = True, alpha_color: torch.Tensor | None = None
 ) -> dict[str, DataparserOutputs]:
-    """Build a capture's views by part (train, val, test), in the order of its photographs. `need_photos`: open
-    downscaled copies for their size; else they may be missing. `alpha_color`: [3] behind transparent photographs.
-    Raises CaptureError: a camera or a photograph cannot be used."""
+    """Build a capture's views by part (train, val, test). `need_photos`: open downscaled copies for their size; else
+    they may be missing. `alpha_color`: [3] behind transparent photographs. Raises CaptureError: a camera or a
+    photograph cannot be used."""
     photographs, frame, points, source = capture.photographs, capture.frame, capture.points, capture.source
     if len(photographs) == 1:
-        fail(f"{source} has one image only. A scene cannot be learned from one view: add photographs.")
+        fail(f"{source} has one image only: add photographs.")
     parts = make_lenses(photographs, capture.downscale, need_photos)
     poses = np.stack([photograph.pose for photograph in photographs])
     if frame.auto_scale_poses:
@@ -97,7 +96,7 @@ def _split(
 
 def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose, float]:
     """Compute the transform [3, 4] that orients and centers poses [N, 4, 4] camera to world, and the scale after it.
-    UTM or ECEF positions, with seven digits before the point, are centered in float64 before nerfstudio's functions."""
+    Large positions (UTM, ECEF) are centered in float64 before nerfstudio's functions."""
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
@@ -110,8 +109,8 @@ def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose,
     transform[:, :3] = u @ v
     far = frame.center_method == "none" and far_from_origin(poses[:, :3, 3])
     if far:
-        where = f"The cameras of {source} lie {np.linalg.norm(middle):,.0f} units from the origin"
-        say(f"{where}, where float32 would blur the scene: their middle becomes the origin.")
+        away = f"{np.linalg.norm(middle):,.0f} units from the origin"
+        say(f"The cameras of {source} lie {away}, too far for float32: their middle becomes the origin.")
     if far or frame.center_method != "none":
         transform[:, 3] -= transform[:, :3] @ middle
     scale = frame.scale_factor
@@ -132,13 +131,15 @@ def pinhole_cameras(pinholes: Sequence[Pinhole], poses: torch.Tensor) -> Cameras
 
 
 def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
-    """Add lenses to the outputs of any nerfstudio parser, with the lenses' pinholes as cameras."""
+    """Add lenses to the outputs of nerfstudio's parsers, with the lenses' pinholes as cameras."""
     if KEY in outputs.metadata:
         return outputs
     cameras = outputs.cameras
     if cameras.camera_to_worlds.ndim != 3:  # nerfstudio's Cameras lose the dimension of a single view
-        what = "nerfstudio's reader of this format fails on a split with a single photograph"
-        fail(f"{what}. Hold out more of them: `--eval-mode interval --eval-interval 4` after the reader's name.")
+        fail(
+            "nerfstudio's reader of this format fails on a single held-out photograph. Hold out more: "
+            "`--eval-mode interval --eval-interval 4` after the reader's name."
+        )
     distortion = cameras.distortion_params
     photographs = []
     for i, file in enumerate(outputs.image_filenames):
@@ -157,7 +158,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
 
 
 def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> DataparserOutputs:
-    """Downscale views of more than `longest` pixels along a side (0 = no limit). Raises InputError: it is negative."""
+    """Downscale views of more than `longest` pixels along a side; 0 = no limit."""
     if longest < 0:
         fail(f"--pipeline.datamanager.longest-side is {longest}: give a number of pixels, or 0 for no limit.")
     facts = CaptureFacts.of(outputs.metadata)
@@ -169,16 +170,14 @@ def limit_size(outputs: DataparserOutputs, longest: int, verbose: bool) -> Datap
     lenses = [small[lens] for lens in lenses]
     if verbose:
         width, height = max(large, key=max)
-        which = f"{len(large)} of {len(lenses)} training photographs have more than {longest} pixels along a side"
-        how = "--pipeline.datamanager.longest-side 0 uses them as they are"
-        say(f"{which} (up to {width} x {height}): they are reduced. {how}.")
+        which = f"{len(large)} of {len(lenses)} training photographs, up to {width} x {height}"
+        say(f"{which}, are reduced to {longest} pixels (--pipeline.datamanager.longest-side 0: as they are).")
     cameras = pinhole_cameras([lens.pinhole for lens in lenses], outputs.cameras.camera_to_worlds)
     metadata = {**outputs.metadata, KEY: dataclasses.replace(facts, lenses=lenses)}
     return dataclasses.replace(outputs, cameras=cameras, metadata=metadata)
 
 
 def select_views(outputs: DataparserOutputs, indices: Sequence[int]) -> DataparserOutputs:
-    """Select views, with all that belongs to them."""
     masks = outputs.mask_filenames
     return dataclasses.replace(
         outputs,

@@ -1,7 +1,6 @@
 """`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure the loss.
 
-Also `python -m bitymi_ns.plugin.export.command`, if nerfstudio does not list the command.
-"""
+Also `python -m bitymi_ns.plugin.export.command`."""
 
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -36,32 +35,30 @@ from .trained import camera_files, compare, load_trained, preview, world_of
 
 @dataclass(kw_only=True)
 class ExportAtlas(BakeOptions):
-    """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest.
-
-    Writes the bundle aside, renames and opens it, and compares it with the trained scene and the photographs on the
-    held-out views."""
+    """Bake a trained bitymi scene into a bundle: surfels, a compressed texture atlas and a manifest; compare it with
+    the trained scene and the photographs on the held-out views."""
 
     load_config: Path  # config.yml of a trained scene.
     output_dir: Path  # Folder of the bundle.
     overwrite: bool = False  # Replace an existing bundle.
     exact: bool = False
-    """Keep everything: tiles at the Nyquist rate of the field, not capped by the training views; unseen surfels; all
-    sites of view colours; and texels as trained or sampled from the field, without fine-tuning."""
+    """Keep everything: tiles at the field's Nyquist rate, not capped by the training views; unseen surfels; all sites
+    of view colours; texels as trained or sampled, without fine-tuning."""
     polish_steps: int | None = None
-    """Steps in which texels, geometry, opacities and view colours learn together from the training photographs, without
-    the network, before tiles and view colours are reduced; 0 = surfels stay as trained. Not given: 0 if texels learned
-    in training, and on a GPU, which lacks kernels for it; else 300, or 4 per photograph if more."""
+    """Steps in which texels, geometry, opacities and view colours learn together from the training photographs, before
+    tiles and view colours are reduced; 0 = none. Not given: 0 if texels learned in training, and on a GPU, which lacks
+    kernels for it; else 300, or 4 per photograph if more."""
     finetune_steps: int | None = None
     """Steps of fine-tuning texels alone, after the polish; 0 = none. Not given: 400 without a polish, 100 after one,
     each with 120 more on texels as stored; only 100 on stored texels if texels learned in training."""
     finetune_memory: float = TuneOptions.cache_bytes / 1e9
-    """GB of memory for traced views in the fine-tuning; changes its time, not its result."""
+    """GB of memory for traced views in the fine-tuning; changes its time alone."""
     compare: bool = True  # Render the held-out views from bundle and trained scene, and state the difference.
 
     extras: tuple[Kind, ...] = ()
-    """Also write the scene for other programs, beside the bundle into a folder of its name and .extras: gaussians (a
-    preview as Gaussian splats), surfels (with two scales), usd (OpenUSD's surflets), mesh (textured quads). `bitymi
-    extras BUNDLE` does so later."""
+    """Also write the scene for other programs, into a folder of the bundle's name and .extras: gaussians (a preview as
+    Gaussian splats), surfels (with two scales), usd (OpenUSD's surflets), mesh (textured quads). `bitymi extras BUNDLE`
+    does so later."""
     extras_frame: Frame = "scene"  # Frame of these files: the scene's, or the capture's own.
     check_room: bool = True
     """Stop if the disk may have too little room, by an estimate that can be many times too high."""
@@ -69,13 +66,13 @@ class ExportAtlas(BakeOptions):
     interchange: bool = False  # Write surfels.ply into a compact bundle, too; bundles of other formats have it.
     compact_error: float = Compact.share
     """Share by which compacting may raise the mean square error against the training photographs, before texels are
-    tuned; less if texels would become too coarse to learn. Surfels, view colours and texels share the bytes by gain."""
+    tuned; less if texels would become too coarse to learn."""
     target_mb: float | None = None
-    """Largest size of a compact bundle in MB (10^6 bytes), instead of compact_error; smaller if that shows the
-    photographs as well, to 0.01 dB."""
+    """Largest size of a compact bundle in MB (10^6 bytes), instead of compact_error; smaller if the photographs are
+    shown as well, to 0.01 dB."""
     target_psnr: float | None = None
     """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: the smallest
-    bundle that reaches it. Held-out views reach less."""
+    bundle that reaches it is made."""
 
     def main(self) -> None:
         exit_messages.install()
@@ -99,7 +96,7 @@ class ExportAtlas(BakeOptions):
             fail(str(error), error)
 
     def _options(self) -> BakeOptions:
-        """Build the options of the bake; stop if one is out of range, before anything is loaded."""
+        """Build the bake's options; stop if one is out of range."""
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
@@ -115,19 +112,18 @@ class ExportAtlas(BakeOptions):
             fail(f"the scene cannot be baked: {error}", error)
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if options.bundle_format != "compact" and getattr(self, name) != getattr(ExportAtlas, name):
-                form = f"--format compact, and this bundle's is {options.bundle_format}"
-                fail(f"--{name.replace('_', '-')} is for {form}")
+                fail(f"--{name.replace('_', '-')} is for --format compact, not {options.bundle_format}")
         self._compact(0)
         if self.target_psnr is not None and not 1 <= self.target_psnr <= 100:
             fail(f"--target-psnr must be from 1 to 100 dB, not {self.target_psnr}")
         if self.target_mb is not None and self.target_psnr is not None:
-            fail("--target-mb and --target-psnr cannot be asked for together: leave one out")
+            fail("--target-mb and --target-psnr cannot be combined: leave one out")
         if not 0 < self.compact_error < 1:
             fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
         return options
 
     def _compact(self, beside: int) -> Compact:
-        """Build the options of the compact bake; `beside`: bytes of the bundle's other files, such as the preview."""
+        """Build the options of the compact bake; `beside`: bytes of the bundle's other files."""
         compact = Compact(self.compact_error, psnr=self.target_psnr)
         try:
             return compact if self.target_mb is None else compact.fitting(self.target_mb, beside)

@@ -52,7 +52,7 @@ class ExportMesh(SurfaceOptions):
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
     format: MeshFormat = "ply"  # Format of the file; files of other formats stay.
     frame: Frame = "capture"
-    """Frame of the vertices: the capture's, with its unit of length, or the scene's, in which nerfstudio trains."""
+    """Frame of the vertices: the capture's, in its unit of length, or the scene's, in which nerfstudio trains."""
     crop: bool = False  # Leave out the surfels that the bundle's notes.json hides.
     overwrite: bool = False  # Replace an existing mesh.
 
@@ -68,7 +68,7 @@ class ExportMesh(SurfaceOptions):
                 self._check_target(path)
                 bundle = bundle_at(self.load_config)
                 if bundle is None and self.crop:
-                    fail(f"--crop is for bundles, whose notes.json has the crop: {self.load_config} is a run's.")
+                    fail(f"--crop is for bundles, which have notes.json: {self.load_config} is a run's.")
                 source = from_run(self.load_config) if bundle is None else from_bundle(bundle, self.crop)
                 say(f"{path}: {self._write(source, path)}")
         except BundleError as error:
@@ -95,13 +95,13 @@ class ExportMesh(SurfaceOptions):
         counts = f"{len(mesh.vertices):,} vertices, {len(mesh):,} triangles, {parts:,} part{'s' if parts > 1 else ''}"
         say(f"{counts}, of {len(cameras)} views")
         if self.watertight and (left := mesh.open_edges()):
-            warn(f"{left:,} edges could not be closed, so that the mesh is not watertight: try another --resolution.")
+            warn(f"{left:,} edges could not be closed: the mesh is not watertight. Try another --resolution.")
         where = " (its node is moved there)" if self.format == "glb" else " (a comment of the file)"
         return f"{size_text(path.stat().st_size)}, in the {self.frame}'s frame" + (note and f"; {note}{where}")
 
 
 def from_run(load_config: Path) -> MeshScene:
-    """Load the scene of a training run's last checkpoint."""
+    """Load a training run's last checkpoint."""
     _, pipeline = load_trained(load_config)
     model, datamanager = pipeline.model, pipeline.datamanager
     cameras = to_cameras(datamanager.train_dataset.cameras, model.device)
@@ -114,14 +114,13 @@ def from_run(load_config: Path) -> MeshScene:
 
 
 def from_bundle(folder: Path, crop: bool = False) -> MeshScene:
-    """Load a bundle with its training cameras. Raises BundleError: it cannot be read, or has no cameras."""
+    """Load a bundle. Raises BundleError: it cannot be read, or has no cameras."""
     bundle = read_bundle(folder, crop=crop)
     if bundle.hidden:
         say(f"{bundle.hidden}.")
     scene = bundle.scene
     cameras = training_cameras(bundle) or [row.camera for row in bundle.cameras]
     if not cameras:
-        advice = "give the config.yml of the run that it was made from"
-        raise BundleError(f"{folder} has no cameras ({CAMERAS}) to see the surface from: {advice}")
+        raise BundleError(f"{folder} has no cameras ({CAMERAS}): give the config.yml of the run that it was made from")
     drawn = (cameras, scene.near, bundle.info.world, texel_alpha(scene))
     return MeshScene(scene.surfels, lambda camera: bundle.render(camera).rgb, *drawn)

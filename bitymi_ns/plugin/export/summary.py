@@ -26,7 +26,7 @@ def decibels(value: float | None) -> str:
 
 
 def print_summary(folder: Path, baked: Coded, info: Manifest, target_mb: float | None = None) -> None:
-    """Print what a bake left out, saved and cost; `info`: of the bundle written from it."""
+    """Print what a bake left out, saved and cost; `info`: of the written bundle."""
     statistics = info.statistics
     table = Table("", "", title=escape(printable(f"Bundle {folder}")), show_header=False)
     table.add_row("Surfels", f"{baked.trained:,} -> {len(baked.rows):,}")
@@ -73,7 +73,7 @@ def print_summary(folder: Path, baked: Coded, info: Manifest, target_mb: float |
 
 
 def print_savings(table: Table, baked: Coded, info: Manifest) -> None:
-    """Add rows for tiles, texels, atlas bytes (by rule, in the bundle) and coding error."""
+    """Add rows for tiles, texels, atlas bytes and coding error."""
     table.add_row("Tiles", f"{baked.trained:,} -> {int((baked.sizes[:, 0] > 0).sum()):,}")
     voxel = "local voxel" if baked.options.local_voxel else "smallest voxel"
     rules = {

@@ -24,18 +24,16 @@ TYPICAL_SIDE = 32  # side of a tile in texels, generously: within a tolerance mo
 def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: bool) -> None:
     needed, free = space_needed(load_config, options, exact), free_bytes(folder)
     if free < needed:
-        beside = " beside the earlier one" if folder.exists() else ""
-        most = f"up to {size_text(needed)}{beside} (a generous estimate by the size of its checkpoint)"
         fail(
-            f"there may be too little room for {folder}: {size_text(free)} are free, and a bundle of this scene may "
-            f"take {most}. Free some space, give an --output-dir on another disk, or try --check-room False: if the "
-            "disk gets full, nothing is left behind."
+            f"there may be too little room for {folder}: {size_text(free)} are free, and the bundle may take up to "
+            f"{size_text(needed)}, by a generous estimate. Free some space, give an --output-dir on another disk, or "
+            "try --check-room False: if the disk gets full, nothing is left behind."
         )
 
 
 def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
-    """Estimate the most bytes of a run's bundle by the size of its newest checkpoint; 0 without one. The checkpoint is
-    taken to hold surfels alone, each with a tile of TYPICAL_SIDE texels per side, or the largest tile if `exact`."""
+    """Estimate the most bytes of a run's bundle by its newest checkpoint, taken to hold surfels alone, each with a tile
+    of TYPICAL_SIDE texels per side, or of the largest if `exact`; 0 without a checkpoint."""
     newest = max(load_config.parent.glob("*/step-*.ckpt"), default=None)
     surfels = newest.stat().st_size // (3 * SURFEL_BYTES) if newest is not None else 0
     side = options.r_max if exact else min(options.r_max, TYPICAL_SIDE)
@@ -53,8 +51,8 @@ def bundle_version(folder: Path) -> tuple[int, int] | None:
 
 
 def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> bytes:
-    """Make the config.yml with which nerfstudio's tools open a bundle. bundle.json does not cover it, as its data path
-    may have to be edited for moved photographs."""
+    """Make the config.yml with which nerfstudio's tools open a bundle. bundle.json has no hash of it, as its data path
+    may have to be edited."""
     config = copy.deepcopy(config)
     red, green, blue = background
     config.pipeline.model = BakedModelConfig(bundle=folder.absolute(), background=(red, green, blue))
@@ -65,8 +63,8 @@ def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> byt
 
 
 def config_without_run(folder: Path, info: Manifest) -> bytes:
-    """Make the config.yml of a bundle without run, which uses its own cameras; `BITYMI_DATA` names a capture, which is
-    read in the frame of its files if that is the bundle's."""
+    """Make the config.yml of a bundle without run, which uses its own cameras; a capture named by `BITYMI_DATA` is read
+    in the frame of its files if that is the bundle's."""
     config: Any = method_config("bitymi").config
     config.experiment_name = folder.name
     config.pipeline.datamanager.data = folder.absolute() / "photographs"

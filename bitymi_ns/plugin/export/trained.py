@@ -34,15 +34,14 @@ MOST_PIXELS = 1600  # longer side of a photograph in a bundle
 
 
 def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
-    """Load configuration and pipeline of a trained scene, at the step of a checkpoint or the last one."""
+    """Load configuration and pipeline of a trained scene, at a checkpoint's step or the last one."""
 
     def choose(config: Any) -> Any:
         config.load_step = step
         return config
 
     if bundle_at(load_config) is not None:
-        what = f"{load_config} is that of a bundle, which is baked already"
-        fail(f"{what}. Give the config.yml of the training run that it was made from.")
+        fail(f"{load_config} is a bundle's. Give the config.yml of the training run that it was made from.")
     if not load_config.is_file():
         fail(f"there is no {load_config}. Give the config.yml of a trained scene (ns-train says where it is).")
     try:
@@ -55,8 +54,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
             fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
         fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
     if not isinstance(pipeline.model, BitymiModel):
-        what = f"{load_config} is a run of the method {config.method_name}, which cannot be baked"
-        fail(f"{what}; give the config.yml of a bitymi training run")
+        fail(f"{load_config} is a run of {config.method_name}: give the config.yml of a bitymi training run")
     return config, pipeline
 
 
@@ -75,8 +73,8 @@ def preview(model: BitymiModel, camera: Camera, format: str = "PNG") -> bytes:
 
 
 def camera_files(datamanager: Any, train: Sequence[Camera], photographs: bool, exposure: Any) -> dict[str, bytes]:
-    """Make cameras.json, with colour corrections by the state of the run's `Exposure` (None: none), and, if asked for,
-    the held-out photographs as JPEG of at most `MOST_PIXELS` along a side: contents by name of the file."""
+    """Make cameras.json, with colour corrections by the state of the run's `Exposure`, and, if asked for, the held-out
+    photographs as JPEG of at most `MOST_PIXELS` along a side: contents by name of the file."""
     files: dict[str, bytes] = {}
     photos = [*datamanager.train_dataset.image_filenames, *datamanager.eval_dataset.image_filenames]
     names = told_apart(photos)
@@ -114,8 +112,8 @@ def compare(model: BitymiModel, datamanager: Any, scene: BakedScene) -> HeldOut:
 
 @torch.no_grad()
 def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views: int) -> list[list[float]]:
-    """Compute PSNR of the first `views` held-out views, a row each: bundle against trained scene, trained scene against
-    photograph, bundle against photograph, and these two after the affine fit of colours."""
+    """Compute PSNR of the first `views` held-out views, a row each: bundle against trained scene, trained scene and
+    bundle against the photograph, and these two after the affine fit of colours."""
     rows = []
     scene, background = scene.to(model.device), model.background
     held_out = datamanager.corrected_eval_views(model.resume_state.get("exposure"))

@@ -28,26 +28,23 @@ from .device import kernel_device
 from .surfel_model import SurfelModel, SurfelModelConfig, box_of
 
 RENDERER, CROP = "BITYMI_RENDERER", "BITYMI_CROP"
-"""Environment variables that override `BakedModelConfig.renderer` and `crop`: ns-eval, ns-render and ns-viewer have no
-options for them."""
+"""Environment variables that override `BakedModelConfig.renderer` and `crop`, for nerfstudio's commands."""
 
 
 @dataclass
 class BakedModelConfig(SurfelModelConfig):
-    """A scene baked into a bundle."""
-
     _target: type = field(default_factory=lambda: BakedModel)
     bundle: Path = Path()  # Folder of the bundle when written; a moved one is found beside its config.yml.
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Colour behind the scene.
     renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
     """kernels: on CUDA or the CPU; fast: the same, but a pixel ends when what follows adds less than half an 8-bit
-    step; webgpu: on GPUs of any vendor, by the package wgpu."""
+    step; webgpu: on any vendor's GPU, by the package wgpu."""
     crop: bool = False
     """Leave out the surfels that the bundle's notes.json hides."""
 
 
 class BakedModel(SurfelModel):
-    """Model that renders a bundle's files alone: no network, no checkpoint."""
+    """Model that renders a bundle."""
 
     config: BakedModelConfig
 
@@ -136,8 +133,8 @@ def check_same_capture(bundle: Path, pipeline: Any) -> None:
     turned = torch.rad2deg(torch.acos((0.5 * (traces - 1)).clamp(-1, 1)))
     if apart.median() > 0.05 or turned.median() > 5:
         fail(
-            f"{bundle} is not of the capture {data.config.data}, or of its frame: half of its cameras are more than "
-            f"{float(apart.median()):.0%} of their extent, or {float(turned.median()):.0f} degrees, from any of the "
+            f"{bundle} is not of the capture {data.config.data}, or of its frame: half of its cameras are "
+            f"{float(apart.median()):.0%} of their extent, or {float(turned.median()):.0f} degrees, or more from the "
             f"capture's. Name its own: `{DATA}=/where/it/is`."
         )
 
@@ -147,4 +144,4 @@ def _webgpu_needed() -> Iterator[None]:
     try:
         yield
     except webgpu.WebGpuUnavailable as error:
-        fail(f"{error}. Or draw with the kernels: leave {RENDERER} and the option renderer as they are.", error)
+        fail(f"{error}. Or draw with the kernels, without {RENDERER} and the option renderer.", error)

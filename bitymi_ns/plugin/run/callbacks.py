@@ -40,10 +40,8 @@ SOON = 60  # seconds: when a run that takes less will end is not said
 
 
 class TrainingRun:
-    """Link between `Training` and nerfstudio's loop. Order of a step there:
-
-    `before` -> `losses` -> backward -> `combine` -> optimisers -> `after`.
-    """
+    """Link between `Training` and nerfstudio's loop: `before` -> `losses` -> backward -> `combine` -> optimisers ->
+    `after`."""
 
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
         trainer: Any = attributes.trainer  # nerfstudio declares those of every method
@@ -105,7 +103,7 @@ class TrainingRun:
         self._longest_side = max(max(camera.width, camera.height) for camera in cameras)
 
     def _compare_sizes(self, step: int) -> None:
-        """Measure for the forecast what a step takes at the sizes of pictures that are to come."""
+        """Measure what a step takes at the sizes of pictures to come."""
         schedule = self.training.schedule
         sizes = {schedule.resolution_factor(later) for later in range(step, self.total)}
         if len(sizes) < 2 or self.scene.surfels["means"].is_cuda:
@@ -118,7 +116,7 @@ class TrainingRun:
         give_back_memory()
 
     def _say_end(self, step: int) -> None:
-        """Say once, after the first steps, when the run will end, and what would halve its time."""
+        """Say once when the run will end, and what would halve its time."""
         if self._end_said or not self.forecast.settled:
             return
         self._end_said = True
@@ -132,19 +130,18 @@ class TrainingRun:
         say(f"The run will end in about {duration(left)}, at {when}{half}.")
 
     def _check_start(self) -> None:
-        """Stop, or warn, if views see nothing of what training starts from: they would give no gradient."""
+        """Stop, or warn, if views see nothing of what training starts from."""
         dataset = self.datamanager.train_dataset
         cameras = [to_camera(dataset.cameras[i : i + 1]) for i in range(len(dataset))]
         empty = [dataset.image_filenames[i] for i in views_without_surfels(self.scene, cameras)]
         if len(empty) == len(dataset):
             fail(
-                f"none of the {len(self.scene):,} points that training starts from lies in any training view: "
-                "nothing could be learned. Either the point cloud is in another frame than the poses, or the cameras "
-                "look the other way (nerfstudio's axes are x right, y up, z back)."
+                f"none of the {len(self.scene):,} points that training starts from lies in any training view. Either "
+                "the point cloud is in another frame than the poses, or the cameras look the other way (nerfstudio's "
+                "axes are x right, y up, z back)."
             )
         if empty:
-            none = f"{listed(empty)} sees none of the points that training starts from"
-            warn(f"{none}: the pose may be wrong, or the point cloud has no points there.")
+            warn(f"{listed(empty)} sees no point: the pose may be wrong, or the point cloud has none there.")
 
     def callbacks(self) -> list[TrainingCallback]:
         return [
@@ -170,7 +167,7 @@ class TrainingRun:
             say(sentence)
 
     def losses(self, index: int) -> dict[str, Tensor]:
-        """Compare a render of training view `index`, at the step's resolution and pose, with its photograph."""
+        """Compare a render of training view `index` with its photograph."""
         try:
             return self.training.losses(self.training.view(index))[0]
         except TrainingDiverged as error:
@@ -197,8 +194,8 @@ class TrainingRun:
 
     def _diverged(self, error: TrainingDiverged) -> NoReturn:
         fail(
-            f"training cannot go on at step {self.training.step}: {error}. Earlier checkpoints are kept; lower "
-            "learning rates (--pipeline.model.train.lr.*) may help.",
+            f"training cannot go on at step {self.training.step}: {error}. Earlier checkpoints are kept. Try lower "
+            "learning rates (--pipeline.model.train.lr.*).",
             error,
         )
 

@@ -1,4 +1,4 @@
-"""Read and check camera paths of `ns-render camera-path` before loading the scene, and write them for nerfstudio."""
+"""Read and check camera paths of `ns-render camera-path`, and write them for nerfstudio."""
 
 import atexit
 import math
@@ -52,7 +52,7 @@ class _Crop(BaseModel):
 
 
 class CameraPath(BaseModel):
-    """Checked camera path in nerfstudio's format, without its unused entries."""
+    """Camera path in nerfstudio's format, without its unused entries."""
 
     render_width: _Side
     render_height: _Side
@@ -78,7 +78,7 @@ class CameraPath(BaseModel):
 
 
 def read_camera_path(file: Path) -> CameraPath:
-    """Read a camera path; warn if its fields of view look like radians. Raises InputError: not renderable."""
+    """Read a camera path; warn if its fields of view look like radians."""
     with reading(f"the camera path {file}", fail, f"{HELP} (--camera-path-filename)"):
         found = read_json(file)
     if isinstance(found, dict) and (found.get("seconds") == 0 or found.get("camera_path") == []):
@@ -90,8 +90,8 @@ def read_camera_path(file: Path) -> CameraPath:
         fail(f"the camera path {file} cannot be used: {where + ': ' if where else ''}{what}. {HELP}", error)
     if path.camera_type.lower() not in ("perspective", "pinhole"):
         fail(
-            f"the camera path {file} is for cameras of type {path.camera_type}: only perspective cameras can be "
-            "rendered. Choose perspective in the viewer's render tab and save the path again."
+            f"the camera path {file} is for {path.camera_type} cameras: choose perspective ones in the viewer's render "
+            "tab and save it again."
         )
     widest = max(frame.fov for frame in path.camera_path)
     if widest < math.pi:

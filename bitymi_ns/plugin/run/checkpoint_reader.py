@@ -31,8 +31,8 @@ BINPERSID
 
 
 def read_archive(file: BinaryIO) -> Any:
-    """Read what `torch.save` wrote: tables, lists, text, numbers and CPU tensors, equal to torch.load's. Raises
-    ValueError, pickle.UnpicklingError and what zipfile raises: it is damaged, or holds anything else."""
+    """Read what `torch.save` wrote: tables, lists, text, numbers and CPU tensors. Raises ValueError,
+    pickle.UnpicklingError and what zipfile raises: it is damaged, or holds anything else."""
     with ZipFile(file) as archive:
         parts = archive.infolist()
         names = [part.filename for part in parts]
@@ -57,7 +57,7 @@ class _Opcodes(dict[int, Callable[[Any], None]]):
 
 
 class _Reader(pickle._Unpickler):
-    """The unpickler in Python, as the one in C allocates by numbers of the file, and lets it set any attribute."""
+    """Python's own unpickler, as the one in C allocates by numbers of the file, and lets it set any attribute."""
 
     stack: list[Any]
     pop_mark: Callable[[], list[Any]]
@@ -122,7 +122,7 @@ def _encode(text: str, _: str) -> bytes:
 
 
 def _number(kind: str, data: bytes) -> Any:
-    """Return a number of numpy, which schedulers leave, as Python's."""
+    """Return one of numpy's numbers, which schedulers leave, as Python's."""
     if kind not in ("f4", "f8", "i4", "i8"):
         raise ValueError("it holds a number of unknown type")
     return np.frombuffer(data, kind)[0].item()

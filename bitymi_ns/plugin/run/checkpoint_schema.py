@@ -1,5 +1,5 @@
-"""Check a checkpoint's entries, the optimisers' included: names, kinds, shapes and types. Compiled code trusts sizes,
-so nothing else uses an entry before."""
+"""Check a checkpoint's entries: names, kinds, shapes and types. Compiled code trusts sizes, so nothing else uses an
+entry before."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SCENE = "_model.scene."  # prefix of the scene's parameters
 SURFELS = f"{SCENE}surfels."
 LARGEST = 1e15  # absolute value of a drawable parameter: its square, and sums of squares, are finite in float32
 _FIELD_GROUPS = {"field_table": ("field.field_table",), "field_mlp": tuple(f"field.field_w{i}" for i in (1, 2, 3))}
-"""Parameters of the optimisers that are not of one surfel parameter, whose name they have."""
+"""Parameters of the optimisers that are not named after one surfel parameter."""
 
 
 class Misfit(ValueError):
@@ -111,8 +111,7 @@ def _kind(value: Any) -> str:
 
 
 def check_unwritten(state: Mapping[str, Any], scene: SceneConfig) -> None:
-    """Check a checkpoint before it is written, on any device and without a copy, as `check_entries`, and the
-    optimisers."""
+    """Check a checkpoint, with its optimisers, before it is written, on any device and without a copy."""
     parameters = check_entries(state, scene)
     for optimizer in Entry(state["optimizers"], "optimizers").parts():
         group = optimizer.name.removeprefix("optimizers.")
@@ -122,7 +121,7 @@ def check_unwritten(state: Mapping[str, Any], scene: SceneConfig) -> None:
 
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
     """Check all entries of a checkpoint, and return the names of parameters with numbers that are not finite, or too
-    large to be drawn. Raises as `check_entries`."""
+    large to be drawn. Raises Misfit."""
     drawable = {
         name.removeprefix("_model."): (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
         for name, values in check_entries(state, scene).items()
@@ -204,7 +203,7 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
 
 
 def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
-    """Check the state of Adam, or its kin, for these parameters. Raises Misfit: an entry is missing or wrong."""
+    """Check the state of Adam, or its kin, for these parameters. Raises Misfit."""
     groups = optimizer["param_groups"]
     if not isinstance(groups.value, list) or len(groups.value) != 1:
         groups.refuse("a list of one group")
@@ -228,8 +227,7 @@ def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
 
 
 def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
-    """Check and load the state of an optimiser of one group, with the file's learning rate and this run's other
-    options."""
+    """Check and load the state of an optimiser of one group; its options but the learning rate are this run's."""
     check_optimizer(saved, [parameter for group in optimizer.param_groups for parameter in group["params"]])
     groups = optimizer.state_dict()["param_groups"]
     groups[0]["lr"] = saved.value["param_groups"][0]["lr"]

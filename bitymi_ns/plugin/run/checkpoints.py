@@ -1,4 +1,4 @@
-"""Checkpoint files: write them whole or not at all, and read them with errors that say what to do."""
+"""Checkpoint files, written whole or not at all."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -22,9 +22,8 @@ MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragm
 
 
 def save(state: dict[str, Any], path: Path, scratch: Path, scene: SceneConfig) -> None:
-    """Write a checkpoint that `load` takes; a crash, a full disk or a wrong state leaves the previous ones as they
-    were. The unfinished file lies in `scratch`, a folder on the same file system: nerfstudio takes any file beside the
-    checkpoints for one."""
+    """Write a checkpoint that `load` takes; on any failure the previous ones stay as they were. The unfinished file
+    lies in `scratch`, on the same file system: nerfstudio takes any file beside the checkpoints for one."""
     try:
         check_unwritten(state, scene)
         with complete_file(path, scratch) as file:
@@ -48,19 +47,17 @@ def save(state: dict[str, Any], path: Path, scratch: Path, scene: SceneConfig) -
 def newest_step(folder: Path) -> int:
     """Find the folder's largest step with a checkpoint."""
     if not folder.is_dir():
-        advice = "Give the nerfstudio_models folder of a run: --load-dir outputs/.../nerfstudio_models"
-        fail(f"there is no checkpoint folder {folder}. {advice}")
+        fail(f"there is no checkpoint folder {folder}. Give a run's: --load-dir outputs/.../nerfstudio_models")
     steps = [int(p.stem[5:]) for p in folder.glob("step-*.ckpt") if p.stem[5:].isdigit()]
     deeper = next((p.parent for p in sorted(folder.glob("*/step-*.ckpt"))), None)
     if not steps and deeper is not None:
         fail(f"{folder} holds no checkpoint itself; they are in {deeper}: --load-dir {deeper}")
     if not steps:
-        fail(f"{folder} holds no checkpoint (step-*.ckpt); the run was stopped before it saved one. Train again.")
+        fail(f"{folder} holds no checkpoint (step-*.ckpt): the run was stopped before it. Train again.")
     return max(steps)
 
 
 def how_to_resume(folder: Path) -> str:
-    """Say how a run with its checkpoints in `folder` goes on."""
     saved = sorted(folder.glob("step-*.ckpt"))
     if not saved:
         return "No checkpoint had been written yet."
@@ -99,24 +96,24 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
 
 
 def check_removed(source: Path | str, scene: Mapping[str, Any], rates: Mapping[str, Any]) -> None:
-    """Fail on recorded options that only earlier versions can follow: those of the scene, and the learning rates."""
+    """Fail on recorded options of the scene and learning rates that only earlier versions can follow."""
     for option, value in (("scene.prefilter", scene.get("prefilter")), ("train.lr.means", rates.get("means"))):
         if value not in (None, "low_pass"):
             fail(f"{source} asks for {option} {value}, which is gone: train the scene again")
 
 
 def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
-    """Fail on parameters of another method, a newer version, or scene options that differ beyond `MAY_DIFFER`."""
+    """Fail on parameters of another method or a newer version, or scene options that differ beyond `MAY_DIFFER`."""
     extra = parameters.get("_model." + EXTRA_STATE) if isinstance(parameters, dict) else None
     if not isinstance(extra, dict) or f"{SURFELS}means" not in parameters:
-        fail(f"{path} is not a checkpoint of this method: it holds no surfels. Load it with the method it is from.")
+        fail(f"{path} is not a checkpoint of this method: it holds no surfels. Load it with its own method.")
     version = Entry(extra, f"pipeline.{EXTRA_STATE}").get("version")
     if version is not None and version.count() > STATE_VERSION:
         fail(f"{path} is from a newer bitymi-ns; update it to load this checkpoint")
     try:
         there, here = dict(json_of(extra["scene"])), dataclasses.asdict(scene)
     except (ValueError, TypeError, KeyError) as error:
-        fail(f"the checkpoint {path} was altered: it does not say what its scene is made of. Train again.", error)
+        fail(f"the checkpoint {path} was altered: it does not describe its scene. Train again.", error)
     rates: Mapping[str, Any] = {}
     with suppress(ValueError, TypeError, LookupError):  # `check` names what is wrong
         rates = dict(json_of(extra["train"])["lr"])
@@ -127,8 +124,4 @@ def _check_kind(parameters: Any, scene: SceneConfig, path: Path) -> None:
         lines = "\n".join(
             f"  --pipeline.model.scene.{k.replace('_', '-')}: {there[k]} there, {here[k]} here" for k in different
         )
-        fail(
-            f"the checkpoint {path} was trained with another preset:\n"
-            f"{lines}\n"
-            "Use the method that it was trained with (see the config.yml beside its nerfstudio_models folder)."
-        )
+        fail(f"the checkpoint {path} was trained with another preset:\n{lines}\nUse that of its run's config.yml.")

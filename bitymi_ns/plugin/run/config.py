@@ -1,4 +1,4 @@
-"""Make nerfstudio configurations of the registered methods from presets."""
+"""Configurations of the registered methods."""
 
 import copy
 import os
@@ -39,8 +39,6 @@ SEEDS = 1 << 32  # end of numpy's range of seeds
 
 @dataclass
 class BitymiTrainerConfig(TrainerConfig):
-    """Configuration of a training run."""
-
     _target: type = field(default_factory=lambda: BitymiTrainer)
     read_from = None  # folder of a config.yml loaded for evaluation; no field, to stay out of config.yml
     vis: Literal[
@@ -77,7 +75,7 @@ class BitymiTrainerConfig(TrainerConfig):
         stated = {option: path for option, path in given.items() if path is not None}
         if len({os.path.abspath(os.path.expanduser(path)) for path in stated.values()}) > 1:
             named = " and ".join(f"{path} ({option})" for option, path in stated.items())
-            fail(f"a run is of one capture, and two are given: {named}. Leave out one of them.")
+            fail(f"two captures are given: {named}. Leave out one of them.")
 
     def set_timestamp(self) -> None:
         """Set timestamp, seeds, device and absolute paths before nerfstudio writes config.yml. If a run has several
@@ -119,10 +117,8 @@ class BitymiTrainerConfig(TrainerConfig):
         checkpoints.check_removed("the configuration", vars(model.scene), vars(model.train.lr))
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
-                option = f"--{name.replace('_', '-')} True"
                 fail(
-                    f"{option} is not supported: it scales the loss, and with it the gradients by which texels move "
-                    "and surfels are densified. The kernels compute in single precision anyway; leave the option out"
+                    f"--{name.replace('_', '-')} True scales the gradients by which surfels are densified: leave it out"
                 )
         for group, steps in self.gradient_accumulation_steps.items():
             if steps < 1 or group not in PARAMETER_GROUPS:
@@ -133,10 +129,10 @@ class BitymiTrainerConfig(TrainerConfig):
             fail(f"there are {gpus} of {asked} GPUs that --machine.num-devices asks for")
 
     def print_to_terminal(self) -> None:
-        """Print nothing: nerfstudio prints every option before checks; `save_config` reports what matters."""
+        """Print nothing; `save_config` reports what matters."""
 
     def save_config(self) -> None:
-        """Check capture and output folder, write config.yml, the run's first file, and print a summary."""
+        """Check capture and output folder, write config.yml, and print a summary."""
         if not torchrun.own().first:
             return
         check_capture(self.pipeline.datamanager)
@@ -176,18 +172,17 @@ class BitymiTrainerConfig(TrainerConfig):
             self.steps_per_save = max(1, self.max_num_iterations // max(1, self.default_saves))
 
     def length(self) -> str:
-        """Describe steps and device, and why the run is shorter than on a GPU."""
+        """Describe steps and device."""
         text = f"{self.max_num_iterations:,} steps on {self.machine.device_type}"
         if (count := torchrun.own().count) > 1:
             text += f", each on {count} views by as many processes"
         short = self.max_num_iterations == self.default_iterations_cpu != self.default_iterations
         if self.machine.device_type == "cpu" and short:
             why = "this installation has no kernels for the GPU" if torch.cuda.is_available() else "no GPU was found"
-            text += f", the short schedule ({why}); for the full one: --max-num-iterations {self.default_iterations}"
+            text += f", a short run ({why}); for the full one: --max-num-iterations {self.default_iterations}"
         return text
 
     def _make_paths_absolute(self) -> None:
-        """Make paths absolute, for commands that read config.yml in any folder."""
         datamanager = self.pipeline.datamanager
         if datamanager.data is None:  # given to the dataparser; the experiment is named after this one
             datamanager.data = getattr(datamanager.dataparser, "data", None)
@@ -200,7 +195,7 @@ class BitymiTrainerConfig(TrainerConfig):
 
     @as_input_error()
     def _take_poses_of_resumed(self) -> None:
-        """Make a resumed run use the resumed one's poses, read as it read them; a new run finds its own."""
+        """Make a resumed run use the resumed one's poses, read in the same way; a new run finds its own."""
         checkpoints_of = self.load_dir or (None if self.load_checkpoint is None else Path(self.load_checkpoint).parent)
         if checkpoints_of is not None:
             run = Path(os.path.expanduser(checkpoints_of)).absolute().parent
@@ -225,11 +220,11 @@ class BitymiTrainerConfig(TrainerConfig):
         return self.vis != "none" and super().is_viewer_enabled()
 
     def get_checkpoint_dir(self) -> Path:
-        """Return the folder of the checkpoints; see `hooks.answer_checkpoint_dir`."""
+        """See `hooks.answer_checkpoint_dir`."""
         return hooks.answer_checkpoint_dir(self, super().get_checkpoint_dir)
 
     def get_base_dir(self) -> Path:
-        """Return the run's folder; in evaluation, the folder of its config.yml, which may have been moved."""
+        """Return the run's folder; in evaluation, that of its config.yml, which may have been moved."""
         return super().get_base_dir() if self.read_from is None else self.read_from
 
 
@@ -240,12 +235,11 @@ class BitymiAdamConfig(OptimizerConfig):
     betas: tuple[float, float] = BETAS  # Decay of the running averages.
 
     def setup(self, params: list[Parameter]) -> Adam:
-        """Create the optimiser as this torch can: config.yml may have been written with another."""
+        """Create the optimiser as this torch can; another may have written config.yml."""
         return adam(params, self.betas, self.lr, self.eps)
 
 
 def method_config(name: str) -> MethodSpecification:
-    """Make the registry entry of a preset."""
     preset = load_preset(name)
 
     def optimizer(group: str) -> BitymiAdamConfig:

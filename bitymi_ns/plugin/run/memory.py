@@ -1,6 +1,5 @@
-"""Estimate memory of training or an export on its device before the start: by fragments of a few views
-(docs/training.md, Memory), and numbers measured with the default preset on the CPU, or counted from arrays on a
-GPU."""
+"""Estimate memory of training or an export before the start: by fragments of a few views (docs/training.md, Memory),
+and numbers measured with the default preset on the CPU, or counted from arrays on a GPU."""
 
 from collections.abc import Sequence
 
@@ -43,12 +42,12 @@ FREED = 500e6
 KEPT_LISTS = 2
 MOST_KEPT = 2.8e6  # pixels of a picture whose colours are such a block; those of larger ones are returned
 PER_SHADED_FRAGMENT = 60
-"""Further bytes with a hash-grid field: surfels and pixels of fragments, points, residuals and their gradients."""
+"""Further bytes with a hash-grid field: surfels, pixels, points and residuals, and their gradients."""
 PER_GPU_FRAGMENT = 4 * NUMBERS  # bytes on a GPU in lists of training
 PER_PASSING_FRAGMENT = 36  # bytes on a GPU in temporary lists, for the coverage of texels; pictures need no list
 PER_BAKED_FRAGMENT = 48
-"""Bytes on a GPU in the fine-tuning of an export: 28 of the list, 1 + 36 of the part that shows texels, at most 43 %
-as measured, and 3 of the pairs of surfel and tile, with about thirty fragments each."""
+"""Bytes on a GPU in the fine-tuning of an export: 28 of the list, 1 + 36 of the part that shows texels, at most 43 % as
+measured, and 3 of the pairs of surfel and tile."""
 PER_BAKED_TEXEL = 96  # bytes in an export: eight copies, as learned, listed, tuned, and in pages
 PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
 """Bytes of a view that the fine-tuning keeps; 22 to 43 % of the fragments show a texel."""
@@ -58,8 +57,8 @@ SPREAD = 1.3  # factor of the stated figures to either side of the estimate
 
 @torch.no_grad()
 def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
-    """Estimate the most fragments at once of any of these views, by a count of a few; larger views than `bound` (0 =
-    that of the CPU kernels, or of a GPU's memory) are drawn in bands."""
+    """Estimate the most fragments at once of any of these views, by a count of a few; those with more than `bound` (0 =
+    what fits) are drawn in bands."""
     p, most = scene.surfels, 0
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
@@ -107,7 +106,7 @@ def state_training(
         advice = f"{fewer} or smaller photographs (--downscale-factor 2)"
     else:
         option = f"--pipeline.model.scene.max-fragments {max(1, fragments // 4)}"
-        advice = f"draw large views in smaller parts, which takes longer: {option}"
+        advice = f"draw views in smaller parts, which takes longer: {option}"
     needed *= 1 if on_gpu else processes
     _state("Training", (needed / SPREAD, needed * SPREAD), cameras, advice, device)
 
@@ -116,8 +115,8 @@ def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
     """Print the memory estimate of an export, from the cameras of the training views, on the CPU. `finetune_bytes`: for
-    the views that the fine-tuning keeps; 0 = no fine-tuning. `learning`: number of surfels that learn in the polish; 0
-    = no polish. `compact`: terms of view colours are chosen by rate-distortion."""
+    the views that the fine-tuning keeps (0 = none). `learning`: number of surfels that learn in the polish. `compact`:
+    terms of view colours are chosen by rate-distortion."""
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     fragments = most_fragments(scene, cameras)
@@ -152,7 +151,7 @@ def _pixels(cameras: Sequence[Camera]) -> tuple[int, int]:
 def _state(
     what: str, needed: tuple[float, float], cameras: Sequence[Camera], advice: str, device: torch.device
 ) -> None:
-    """Print the need, from low to high, and a warning if the machine or GPU has less."""
+    """Print the need, from low to high; warn if the machine or GPU has less."""
     sizes = {(camera.width, camera.height) for camera in cameras}
     width, height = max(sizes, key=lambda size: size[0] * size[1])
     photographs = f"{len(cameras)} training photographs of {'up to ' * (len(sizes) > 1)}{width} x {height}"

@@ -1,4 +1,4 @@
-"""Measure image quality and honest render times."""
+"""Measure image quality and render times."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +12,7 @@ from bitymi_ns.train.losses import color_fitted, psnr
 from . import lpips
 
 LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
-"""Backbones of LPIPS by name in the results: nerfstudio's and gsplat's convention, and 3DGS's."""
+"""Backbones by name in the results: nerfstudio's and gsplat's convention, and 3DGS's."""
 _lpips_missing: list[str] = []
 
 
@@ -21,8 +21,8 @@ def image_metrics(
 ) -> dict[str, float]:
     """Measure psnr, ssim, flip (if its package is installed), lpips and lpips_vgg (if their weights can be had) of
     images [H, W, 3] in [0, 1]; fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image; and
-    mean_exposure_psnr and so on of the image without correction, if one is given. Pixels that a mask [H, W, 1] excludes
-    are 0 in all images, and left out of PSNR and fit."""
+    mean_exposure_psnr and so on of the image without correction, if given. Pixels that a mask [H, W, 1] excludes are 0
+    in all images, and left out of PSNR and fit."""
     image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
@@ -49,7 +49,7 @@ def _similarity(image: Tensor, reference: Tensor, mask: Tensor | None, distances
 
 
 def flip(image: Tensor, reference: Tensor) -> float | None:
-    """Measure NVIDIA's FLIP (LDR), mean over the image; None without its package."""
+    """Measure the mean of NVIDIA's FLIP (LDR); None without its package."""
     try:
         from flip_evaluator import nbflip
     except ImportError as error:
@@ -62,8 +62,7 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
 
 
 def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dict[str, float]:
-    """Measure distances by names in `LPIPS` that have weights; empty for images of fewer than 32 pixels along a
-    side."""
+    """Measure distances by names in `LPIPS`; empty without weights, or below 32 pixels along a side."""
     found: dict[str, float] = {}
     for name in names if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():
         if name in _lpips_missing:  # fetched together: the next one is missing, too
@@ -81,7 +80,7 @@ REPEATS = 3  # of timed renders
 
 
 def render_milliseconds(render: Callable[[], Any], device: torch.device) -> float:
-    """Measure the median time of rendering alone, after a warm-up, waiting for the device each time."""
+    """Measure the median time of rendering alone, after a warm-up."""
 
     wait = torch.cuda.synchronize if device.type == "cuda" else lambda _: None
 

@@ -40,14 +40,12 @@ PARAMETER_GROUPS = (*PARAMETERS, "field_table", "field_mlp")
 
 @dataclass
 class BitymiModelConfig(SurfelModelConfig):
-    """Configuration of the model."""
-
     _target: type = field(default_factory=lambda: BitymiModel)
     scene: SceneConfig = field(default_factory=SceneConfig)  # Representation of the scene.
     train: TrainConfig = field(default_factory=TrainConfig)  # Training options.
     steps: tyro.conf.Suppress[int | None] = None  # Length of a run to come.
     curve_points: int = 20
-    """Evaluations over a run for the curve of quality against time (training_curve.jsonl); 0 = none."""
+    """Evaluations over a run for the curve of quality against time; 0 = none."""
     curve_views: int = 8  # Held-out views per point of that curve, all for the last one; 0 = all.
 
 
@@ -67,8 +65,7 @@ def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparen
 
 
 class BitymiModel(SurfelModel):
-    """Textured Beta surfels. Checkpoints hold, beside parameters, all that a resumed run needs to go on as if
-    uninterrupted: the state of strategy, random generators and clocks."""
+    """Textured Beta surfels. Checkpoints hold all that a resumed run needs to go on as if uninterrupted."""
 
     config: BitymiModelConfig
 
@@ -97,8 +94,8 @@ class BitymiModel(SurfelModel):
 
     @contextmanager
     def _cropped(self) -> Iterator[None]:
-        """Set the opacity of surfels outside the crop box to 0 meanwhile: tiles of texels are counted by surfels, none
-        of which may be missing."""
+        """Set the opacity of surfels outside the crop box to 0 meanwhile: none may be missing, as tiles are counted by
+        surfels."""
         if self.crop_box is None:
             yield
             return
@@ -153,7 +150,7 @@ class BitymiModel(SurfelModel):
         return {"photometric": photometric(outputs["rgb"], target, self.train_config.loss.ssim_weight, mask)}
 
     def get_extra_state(self) -> dict[str, Any]:
-        """Return tensors, numbers and text only, for torch's safe mode."""
+        """Return tensors, numbers and text only."""
         state: dict[str, Any] = {"version": STATE_VERSION, "scene": json.dumps(dataclasses.asdict(self.config.scene))}
         state["train"] = messages.recorded(self.train_config)
         state["near"], state["first_surfels"] = self.scene.near, self.first_surfels
@@ -172,7 +169,7 @@ class BitymiModel(SurfelModel):
             self.scene.near = state.get("near", 0.2)  # all scenes' value in older checkpoints
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
-        """Load a checkpoint of any number of surfels; `checkpoints.load` has checked that it fits this preset."""
+        """Load a checkpoint of any number of surfels, which `checkpoints.load` has checked."""
         self.scene.resize_for_state(state_dict, "scene.")
         for name, parameter in self.named_parameters():
             saved = state_dict.get(name)
@@ -194,8 +191,8 @@ def new_scene(
     facts: CaptureFacts,
     steps: int | None = None,
 ) -> Scene:
-    """Make surfels at points (positions [N, 3], colours [N, 3] uint8 or empty), or at random in the capture's box, and
-    an empty texture field around them; `steps`: the length of a run to come."""
+    """Make surfels at points (positions [N, 3], colours [N, 3] uint8 or empty), or at random in the capture's box;
+    `steps`: length of a run to come."""
     centers, pixels = facts.camera_centers, facts.train_pixels
     if steps is not None:
         train = limit_first_surfels(train, steps, pixels, len(centers))
@@ -210,8 +207,7 @@ def new_scene(
     box = None
     if not bool(torch.isfinite(xyz).all(1).any()):
         if len(xyz):
-            advice = "Make the cloud again, or remove ply_file_path from transforms.json to start from random points."
-            fail(f"all {len(xyz)} points of the capture's point cloud are NaN or infinite. {advice}")
+            fail(f"all {len(xyz)} points of the capture are NaN or infinite. Make them again, or remove them.")
         box = None if scene_box is None else _corners(scene_box)
     many, started = len(xyz) >= MANY_POINTS, time.perf_counter()
     if many:
@@ -230,8 +226,7 @@ def new_scene(
         say(f"{report.background:,} more surfels start where the photographs show no point.")
     usable = report.given - report.not_finite - report.duplicates
     if 0 < usable < FEW_POINTS:
-        advice = "If little appears, remove it (ply_file_path in transforms.json) to start from random points."
-        warn(f"The capture's point cloud has only {usable} different points to start from. {advice}")
+        warn(f"The capture has only {usable} different points. If little appears, start without (ply_file_path).")
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
         what = f"{report.not_finite} of {report.given} points of the capture are NaN or infinite"
@@ -240,13 +235,11 @@ def new_scene(
 
 
 def _corners(scene_box: SceneBox) -> Tensor:
-    """Return low and high corner [2, 3]."""
     corners = scene_box.aabb.float().cpu().reshape(2, 3)
     low, high = corners
     if not bool(torch.isfinite(corners).all()) or not bool((high > low).all()):
         fail(
-            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it in the "
-            "capture's files; in nerfstudio's own format give a point cloud (ply_file_path in transforms.json) or a "
-            "positive --scene-scale after `nerfstudio-data`."
+            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it in its files; "
+            "in nerfstudio's own format give a point cloud, or a positive --scene-scale after `nerfstudio-data`."
         )
     return corners

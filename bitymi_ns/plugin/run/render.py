@@ -1,8 +1,5 @@
 """Rendering in `ns-render`: films and frames without the ffmpeg program, options checked before a scene is loaded.
-
-nerfstudio's script reads a camera path, or makes one from the capture's cameras, and calls a function that renders and
-writes. `hooks.patch_render` replaces its functions by those of this module.
-"""
+`hooks.patch_render` replaces functions of nerfstudio's script by those of this module."""
 
 import math
 import time
@@ -32,7 +29,8 @@ TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
 OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")  # outputs of every surfel scene
 WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs drawn without maps
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
-"""Sampled frames, their longer side in pixels, and the share of depths clipped at either end: a film's depth range."""
+"""Frames sampled for a film's depth range, their longer side in pixels, and the share of depths clipped at either
+end."""
 TURNS = 2  # of a spiral
 FAINT = 1 / 255  # accumulation of a pixel that shows nothing
 OPTION = " (--output-path)."
@@ -40,7 +38,7 @@ OPTION = " (--output-path)."
 
 def leave_out_photographs(command: Any) -> bool:
     """Have `ns-render dataset` draw all outputs, and no photographs, if it names none; return True if it then needs no
-    photographs, False for other commands."""
+    photographs."""
     if type(command).__name__ != "DatasetRender":
         return False
     if command.rendered_output_names is None:
@@ -85,8 +83,8 @@ def check_options(command: Any) -> None:
             fail(f"--{name.replace('_', '-')} must be {between}, not {value}.")
     if command.render_nearest_camera or command.check_occlusions:
         fail(
-            "--render-nearest-camera and --check-occlusions need rays, and surfels are drawn as whole pictures: leave "
-            "them out. `ns-render dataset` writes photographs beside renders."
+            "--render-nearest-camera and --check-occlusions need rays: leave them out. `ns-render dataset` writes "
+            "photographs beside renders."
         )
     _check_outputs(command, not as_film and command.image_format == "png")
     dataset = not hasattr(command, "output_format")
@@ -131,17 +129,17 @@ def _check_outputs(command: Any, transparency: bool) -> None:
         if output not in OUTPUTS and not (dataset and output.startswith("gt-")):
             fail(f"there is no output {name}: --rendered-output-names may be {', '.join(OUTPUTS)}{more}.")
     if "rgba" in names and not transparency:
-        fail("rgba has transparency, which JPEG and films have not: add --image-format png (and frames, not a film).")
+        fail("rgba has transparency: add --image-format png (and frames, not a film).")
     if "rgba" in names and len(names) > 1 and not dataset:
-        fail("rgba cannot stand beside other outputs in a frame: name it alone in --rendered-output-names.")
+        fail("rgba cannot stand beside other outputs: name it alone in --rendered-output-names.")
 
 
 def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
-    """Make nerfstudio's path between cameras, in the first one's size and with all principal points interpolated."""
+    """Make nerfstudio's path between cameras, in the first one's size, with principal points interpolated."""
     if len(cameras) < 2:
         fail(
-            f"a path leads from camera to camera, and there is {'only one' if len(cameras) else 'none'} to start from. "
-            "Choose --pose-source train, or `ns-render spiral`."
+            f"a path needs two cameras, and there is {'only one' if len(cameras) else 'none'}. Choose --pose-source "
+            "train, or `ns-render spiral`."
         )
     path = stock(cameras=cameras, **options)
     points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
@@ -153,7 +151,7 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
 
 
 def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
-    """Give a path's cameras their frames' `principal_point`, shares of width and height, which nerfstudio ignores."""
+    """Give a path's cameras their `principal_point`, shares of width and height, which nerfstudio ignores."""
     points = torch.tensor([frame["principal_point"] for frame in found["camera_path"]]).float()
     path.cx, path.cy = found["render_width"] * points[:, :1], found["render_height"] * points[:, 1:]
     return path
@@ -162,7 +160,7 @@ def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
 @torch.no_grad()
 def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cameras:
     """Make cameras on a spiral around `start`, `radius` scene units along its axes, all facing the point at the median
-    depth of its image's centre. nerfstudio's spiral rolls, as it takes a world axis for the camera's up axis."""
+    depth of its image's centre. nerfstudio's spiral rolls: it takes a world axis for the camera's up axis."""
     camera = to_camera(start, model.device).within(DEPTH_SIDE)
     outputs = model.outputs_of(camera, maps=True)
     y, x = camera.height // 3, camera.width // 3
@@ -183,7 +181,7 @@ def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cam
 
 @torch.no_grad()
 def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds: float) -> None:
-    """Render a path, or a spiral, as a film or frames, whole or not at all. Raises InputError: it cannot be written."""
+    """Render a path, or a spiral, as a film or frames. Raises InputError: it cannot be written."""
     if hasattr(command, "radius"):
         cameras = spiral(model, cameras, int(command.frame_rate * command.seconds), command.radius)
     fps = len(cameras) / seconds if hasattr(command, "camera_path_filename") else float(command.frame_rate)
@@ -216,14 +214,13 @@ def write_trajectory(model: SurfelModel, cameras: Cameras, command: Any, seconds
         what += f", {fps:.3g} per second, {size_text(target.stat().st_size)}"
     say(f"{target}: {what}; {time.monotonic() - started:.1f} s")
     if empty:
-        nothing = f"{empty} of {len(views)} frames show nothing of the scene"
-        warn(f"{nothing}: the cameras look past it, or the path was made for another one.")
+        warn(f"{empty} of {len(views)} frames show nothing: is the path of another scene?")
 
 
 def _picture(
     model: SurfelModel, camera: Any, names: Sequence[str], planes: dict[str, float], options: Any
 ) -> tuple[np.ndarray, bool]:
-    """Draw outputs side by side in nerfstudio's colours [H, W, 3 or 4] uint8, and whether the scene shows."""
+    """Draw outputs side by side in nerfstudio's colours [H, W, 3 or 4] uint8; return whether the scene shows, too."""
     outputs = model.outputs_of(camera, maps=not WITHOUT_MAPS.issuperset(names))
     outputs["rgba"] = model.get_rgba_image(outputs)
     parts = []
@@ -238,7 +235,7 @@ def _picture(
 
 
 def _depth_planes(model: SurfelModel, views: Sequence[Any], command: Any) -> dict[str, float]:
-    """Return the depth range of the colours: from the options, else common to all frames, so that colours compare."""
+    """Return the depth range of the colours: from the options, else common to all frames."""
     seen = []
     for i in spread(len(views), DEPTH_VIEWS):
         outputs = model.outputs_of(views[i].within(DEPTH_SIDE), maps=True)

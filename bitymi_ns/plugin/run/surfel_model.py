@@ -1,4 +1,4 @@
-"""Base of nerfstudio models of trained and baked scenes: outputs, metrics and images."""
+"""Base of nerfstudio models of trained and baked scenes."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ from .device import kernel_device
 from .metrics import image_metrics, render_milliseconds
 
 OVERDRAW_SCALE = 64.0
-"""Blended surfels per pixel at the end of overdraw's colour map, fixed to compare runs."""
+"""Blended surfels per pixel at the end of overdraw's colour map."""
 
 
 @dataclass
 class SurfelModelConfig(ModelConfig):
-    """Base of model options. Options of nerfstudio for models of rays have no meaning here and are hidden in --help."""
+    """Base of model options. nerfstudio's options for models of rays are hidden in --help."""
 
     enable_collider: tyro.conf.Suppress[bool] = False
     collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
@@ -47,12 +47,10 @@ def box_of(box: OrientedBox | None) -> Box | None:
 
 
 class SurfelModel(Model):
-    """Model that renders whole images from surfels."""
-
     measure_time = True  # include render_ms in the image metrics; off in training
     crop_box: Box | None = None  # hides the surfels whose centres lie outside
     corrections: Sequence[tuple[Camera, Tensor | None]] = ()
-    """Cameras of the capture's photographs with their colour corrections; empty if the run made none."""
+    """Cameras of the capture's photographs with their colour corrections, if the run made some."""
 
     @abstractmethod
     def render(self, camera: Camera, background: Tensor, maps: bool) -> Any:
@@ -60,19 +58,19 @@ class SurfelModel(Model):
 
     @abstractmethod
     def sizes(self) -> dict[str, float]:
-        """Return the number of `surfels`, and other sizes for the image metrics."""
+        """Return the number of `surfels`, and other sizes."""
 
     @property
     @abstractmethod
     def background(self) -> Tensor:
-        """Colour [3] behind the scene in evaluation."""
+        """Colour [3] in evaluation."""
 
     def crop_to(self, box: OrientedBox | None) -> None:
-        """Hide the surfels outside of nerfstudio's crop box, or none."""
+        """Hide the surfels outside of nerfstudio's crop box."""
         self.crop_box = box_of(box)
 
     def to(self, *args: Any, **kwargs: Any) -> SurfelModel:
-        """Move the model, except to a device without kernels here, as nerfstudio's tools use any GPU."""
+        """Move the model, except to a device without kernels."""
         core: Any = torch._C
         device, dtype, _, _ = core._nn._parse_to(*args, **kwargs)
         if dtype is not None:
@@ -87,7 +85,7 @@ class SurfelModel(Model):
     def outputs_of(self, camera: Camera, maps: bool) -> dict[str, Tensor]:
         """Draw the outputs of viewer and ns-render, each [H, W, C] float32: rgb, accumulation; with maps also depth =
         expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0 for none), beta = blended
-        kernel exponent / 4, overdraw = surfels blended at the pixel / OVERDRAW_SCALE (colour maps span 0 to 1)."""
+        kernel exponent / 4, overdraw = surfels blended at the pixel / OVERDRAW_SCALE."""
         output = self.render(camera, self.background, maps=maps)
         outputs = {"rgb": output.rgb.clamp(0.0, 1.0), "accumulation": output.alpha}
         if output.depth is not None:
@@ -103,7 +101,7 @@ class SurfelModel(Model):
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
         """Render a camera, with only the surfels in the crop box if one is given. In the viewer's thread, which a
-        refusal would end for good, a camera that cannot be rendered gives an empty picture."""
+        refusal would end, a camera that cannot be rendered gives an empty picture."""
         self.crop_to(obb_box)
         try:
             self._last_camera = to_camera(camera, self.device)
@@ -128,7 +126,7 @@ class SurfelModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Measure a held-out view's quality and cost, and show photograph and render side by side."""
+        """Measure a held-out view's quality and cost; show photograph and render side by side."""
         rgb = outputs["rgb"]
         height, width = rgb.shape[:2]
         target, mask = self.photograph(batch, rgb)
@@ -148,7 +146,7 @@ class SurfelModel(Model):
         return metrics, {"img": torch.cat([target, rgb], dim=1)}
 
     def _exposed(self, camera: Camera) -> Tensor:
-        """Draw a view [H, W, 3] with the colour correction of its photograph, or none if it has no photograph."""
+        """Draw a view [H, W, 3] with its photograph's colour correction, if any."""
 
         def apart(other: Camera) -> float:
             return float((other.viewmat.cpu() - camera.viewmat.cpu()).abs().max())
@@ -160,7 +158,7 @@ class SurfelModel(Model):
         return shown(drawn.rgb, correction, drawn.alpha, self.background)
 
     def get_rgba_image(self, outputs: dict[str, Tensor], output_name: str = "rgb") -> Tensor:
-        """Return [H, W, 4] with straight alpha, for `ns-render --rendered-output-names rgba`."""
+        """Return [H, W, 4] with straight alpha."""
         alpha = outputs["accumulation"]
         rgb = (outputs[output_name] - (1.0 - alpha) * self.background.to(alpha)) / alpha.clamp(min=1e-6)
         return torch.cat([torch.where(alpha > 0, rgb, 0.0).clamp(0.0, 1.0), alpha], dim=-1)

@@ -33,16 +33,16 @@ CONFIG = "config"  # file of the pickled configuration, and its key in torch.dis
 
 
 def own(group: str = "") -> Processes:
-    """Return this process's rank in the run and the number of processes; LOCAL_: the same on this machine; GROUP_: the
-    rank of this machine and the number of machines."""
+    """Return this process's rank in the run and the number of processes; LOCAL_: on this machine; GROUP_: rank and
+    number of machines."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return ALONE
     return Processes(int(os.environ[f"{group}RANK"]), int(os.environ[f"{group}WORLD_SIZE"]))
 
 
 def run(config: TrainerConfig) -> NoReturn:
-    """Start the processes of a run with torchrun, wait for them, and exit with their status; with a message where no
-    process has printed one."""
+    """Start a run's processes with torchrun, wait for them, and exit with their status, or a message where none has
+    printed one."""
     from torch.distributed.launcher.api import ChildFailedError, SignalException
     from torch.distributed.run import main as torchrun
 
@@ -73,8 +73,8 @@ def run(config: TrainerConfig) -> NoReturn:
 
 
 def end(statuses: dict[int, int], count: int) -> NoReturn:
-    """Exit with the status of the process that failed first, and print a message unless it has printed one. `statuses`:
-    by rank, in the order in which torchrun noticed them; negative: killed by that signal. `count`: of processes."""
+    """Exit with the status of the process that failed first, and print a message unless it has. `statuses`: by rank, in
+    the order in which torchrun noticed them; negative: killed by that signal. `count`: of processes."""
     rank, status = next(((r, s) for r, s in statuses.items() if s != LOST), (0, LOST))
     if status == LOST:
         fail(f"the {count} processes of this run lost contact, or one did not answer for {TIMEOUT}")
@@ -85,7 +85,7 @@ def end(statuses: dict[int, int], count: int) -> NoReturn:
 
 
 def work() -> None:
-    """Train in a process started by `run`, with the configuration in the folder named on the command line."""
+    """Train in a process started by `run`."""
     from nerfstudio.scripts.train import train_loop
 
     tempfile.tempdir = sys.argv[1]  # `run` removes it, whatever ends this process
@@ -102,7 +102,7 @@ def work() -> None:
 
 def join(config: Any) -> None:
     """Join torch.distributed's default group: gloo for CPU tensors, nccl for CUDA tensors. The other processes take the
-    configuration of the first. Raises InputError: another process has ended."""
+    first one's configuration. Raises InputError: another process has ended."""
     try:
         with raise_process_lost():
             store: Any

@@ -42,12 +42,12 @@ AGAIN = 1.0  # seconds within which signals count as one: a batch system's arriv
 
 
 class _StopAfterStep(Exception):
-    """Request to end training after a step."""
+    """Ends training after a step."""
 
 
 class TogetherOptimizers(Optimizers):
     """nerfstudio's optimisers, one per parameter group, stepped together, which is faster. `combine` is called before
-    each step, once the gradients are computed, and returns the factors of `optimizers.step`."""
+    each step and returns the factors of `optimizers.step`."""
 
     def __init__(
         self, config: dict[str, Any], groups: dict[str, list[Parameter]], combine: Callable[[], Mapping[str, Tensor]]
@@ -68,8 +68,8 @@ class TogetherOptimizers(Optimizers):
 
 
 class BitymiTrainer(Trainer):
-    """Trainer to a total number of steps, so that interrupted and resumed runs end like uninterrupted ones. Every
-    process of a run has one; they train in step."""
+    """Trainer to a total number of steps, so that resumed runs end like uninterrupted ones. Every process of a run has
+    one; they train in step."""
 
     config: Any  # nerfstudio declares those of every method
     pipeline: Any
@@ -149,8 +149,7 @@ class BitymiTrainer(Trainer):
     def _train_to_the_end(self) -> None:
         total = self.config.max_num_iterations
         if self._start_step >= total:
-            done = f"the checkpoint has {self._start_step:,} of {total:,} steps"
-            warn(f"Nothing to do: {done}. For a longer run give a larger --max-num-iterations.")
+            warn(f"The checkpoint has {self._start_step:,} of {total:,} steps: give a larger --max-num-iterations.")
             return
         if self.processes.first:  # of every parameter a checkpoint holds the value and Adam's two moments
             learned = [p.nbytes for p in self.pipeline.parameters() if p.requires_grad]
@@ -218,8 +217,6 @@ class BitymiTrainer(Trainer):
 
 
 class BitymiPipeline(VanillaPipeline):
-    """nerfstudio's pair of data manager and model."""
-
     datamanager: Any  # nerfstudio declares those of every method
     model: Any
 
@@ -229,7 +226,6 @@ class BitymiPipeline(VanillaPipeline):
         self.datamanager.world_size = world_size
 
     def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Tensor], dict[str, Tensor]]:
-        """Return no images, and the loss terms and metrics of the step's training view."""
         losses = self.model.run.losses(self.datamanager.train_index(step))
         return {}, losses, self.model.get_metrics_dict({}, {})
 
@@ -251,20 +247,18 @@ class BitymiPipeline(VanillaPipeline):
             self.model.corrections = list(zip(held_out, found, strict=True))
 
     def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
-        """Average the metrics over the images, leaving out those that are NaN (JSON has no NaN) because no pixel of an
-        image counts; the deviation of a single image is 0."""
+        """Average the metrics over the images, leaving out those that are NaN, as JSON has no NaN; the deviation of a
+        single image is 0."""
         if len(data_loader) == 0:
-            fail("there is no held-out view to evaluate: none was held out, or their masks exclude every pixel")
+            fail("there is no held-out view: none was held out, or their masks exclude every pixel")
         metrics = super().get_average_image_metrics(data_loader, *args, **kwargs)
         missing = [k for k, v in metrics.items() if math.isnan(v) and not k.endswith("_std")]
         if missing:
-            warn(f"{', '.join(missing)} is left out: there is a held-out view of which no pixel counts.")
+            warn(f"{', '.join(missing)} is left out: no pixel of a held-out view counts.")
         kept = {k: v for k, v in metrics.items() if k.removesuffix("_std") not in missing}
         return {k: 0.0 if math.isnan(v) else v for k, v in kept.items()}
 
 
 @dataclass
 class BitymiPipelineConfig(VanillaPipelineConfig):
-    """Configuration of the pipeline."""
-
     _target: type = field(default_factory=lambda: BitymiPipeline)

@@ -26,7 +26,7 @@ def test_cameras_and_pictures_are_reduced_together(capture: Path, capsys: pytest
     """At half the size a pixel is the mean of four and has the same rays."""
     whole, half = load(capture, 0), load(capture, 24)
     said = " ".join(capsys.readouterr().out.split())
-    assert "10 of 10 training photographs have more than 24 pixels along a side (up to 48 x 36)" in said
+    assert "10 of 10 training photographs, up to 48 x 36, are reduced to 24 pixels" in said
     for index in range(len(whole.train_dataset)):
         large, small = whole.train_views[index], half.train_views[index]
         assert small.image.shape == (18, 24, 3)

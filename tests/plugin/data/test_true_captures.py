@@ -88,7 +88,7 @@ def test_coordinates_of_a_map(
         outputs = manager.train_dataparser_outputs
         back = outputs.transform_poses_to_original_space(outputs.cameras.camera_to_worlds)
         assert np.abs(back[:, :, 3].numpy().mean(0) - offset).max() < 10.0
-    moved = "float32 would blur the scene: their middle becomes the origin" in printed(capsys)
+    moved = "too far for float32: their middle becomes the origin" in printed(capsys)
     assert moved is (centred == "none" or fixed)
 
 

@@ -182,7 +182,7 @@ def test_altered_contents(saved: Path) -> None:
         altered = state(SceneConfig())
         altered["pipeline"]["_model._extra_state"]["scene"] = scene
         torch.save(altered, saved)
-        refused(saved, "was altered: it does not say what its scene is made of")
+        refused(saved, "was altered: it does not describe its scene")
 
 
 MEANS, SIZE, EXTRA = "_model.scene.surfels.means", "_model.scene.field.size", "_model._extra_state"
@@ -207,7 +207,7 @@ WRONG = [
     (("optimizers",), [1], "optimizers has to be a table of entries"),
     (("schedulers",), 3, "schedulers has to be a table"),
     (("pipeline", EXTRA, "version"), "two", "_extra_state.version has to be a whole number"),
-    (("pipeline", EXTRA, "scene"), "[" * 100_000, "does not say what its scene is made of"),
+    (("pipeline", EXTRA, "scene"), "[" * 100_000, "does not describe its scene"),
     (("pipeline", EXTRA, "near"), "0.1", "_extra_state.near has to be a number"),
     (("pipeline", EXTRA, "trained_for"), -3, "trained_for has to be from 1"),
     (("pipeline", MEANS), torch.zeros(5, 2), r"scene.surfels.means has to be float32 \[any, 3\], not float32 \[5, 2\]"),

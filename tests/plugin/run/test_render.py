@@ -263,7 +263,7 @@ BAD_PATHS = {
     "seconds: Input should be a finite number": lambda p: p.update(seconds=math.inf),
     "makes 12000 frames per second: correct its seconds": lambda p: p.update(seconds=0.001),
     "render_height: Input should be less than or equal to 16384": lambda p: p.update(render_height=100_000),
-    "for cameras of type equirectangular: only perspective": lambda p: p.update(camera_type="equirectangular"),
+    "for equirectangular cameras: choose perspective": lambda p: p.update(camera_type="equirectangular"),
 }
 
 
@@ -296,7 +296,7 @@ def test_files_without_camera_path(wall: Wall, camera_path: Any, tmp_path: Path,
     with pytest.raises(InputError, match="path.json cannot be used: Input should be .*dictionary"):
         camera_path([1, 2])
     monkeypatch.setattr(HeldOut, "count", 1)
-    with pytest.raises(InputError, match="there is only one to start from. Choose --pose-source train"):
+    with pytest.raises(InputError, match="there is only one. Choose --pose-source train"):
         render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
 
 
@@ -326,7 +326,7 @@ def test_empty_frames_are_counted(wall: Wall, camera_path: Any, tmp_path: Path, 
     wall.render = render_some  # type: ignore[method-assign]
     camera_path(output_format="images", rendered_output_names=["depth"])
     said = " ".join(capsys.readouterr().out.split())
-    assert "of 12 frames show nothing of the scene: the cameras look past it" in said
+    assert "of 12 frames show nothing" in said
     assert len(list((tmp_path / "film").iterdir())) == 12
 
 

@@ -33,7 +33,7 @@ _MESH = (
     "Gaussian splats."
 )
 _RAYS = "needs rays, and surfels are drawn as whole pictures"
-_REFUSED = {
+REFUSED = {
     "ExportPointCloud": f"pointcloud {_RAYS}",
     "ExportTSDFMesh": f"tsdf {_RAYS}",
     "ExportPoissonMesh": f"poisson {_RAYS}",
@@ -137,7 +137,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     command = None if running is None else running[0]
     if evaluated is not None:
         exit_messages.install()
-        refused = _REFUSED.get(type(command).__name__)
+        refused = REFUSED.get(type(command).__name__)
         if refused is not None:
             fail(f"ns-export {refused}. {_MESH}")
         patch_viewer(config)

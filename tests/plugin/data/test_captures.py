@@ -20,6 +20,7 @@ from bitymi_ns.plugin.run.model import train_config_for
 from bitymi_ns.train.config import TrainConfig
 from tests.captures import expect, images_of, load
 from tests.stand_in_card import CARD
+from tests.typed import Patch
 
 
 def test_every_eighth_image_is_held_out_and_cached_without_cuda(capture: Path) -> None:
@@ -45,9 +46,7 @@ def test_a_batch_does_not_share_its_dictionary_with_the_cache(capture: Path) -> 
     assert manager.cached_train[0]["image"] is not None
 
 
-def test_photographs_of_a_run_on_a_card_stay_in_memory_of_the_host(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_photographs_of_a_run_on_a_card_stay_in_memory_of_the_host(capture: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(dataset, "PHOTOGRAPH_BYTES", 0)
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=40_000))
     manager = load(capture)
@@ -101,7 +100,7 @@ def test_the_color_behind_transparent_photographs() -> None:
     assert train_config_for(TrainConfig(), None, False).background == "black"
 
 
-def test_a_file_without_permission_is_named(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_without_permission_is_named(capture: Path, monkeypatch: Patch) -> None:
     def denied(*_: object) -> None:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(capture / "images"))
 

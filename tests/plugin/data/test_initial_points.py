@@ -20,6 +20,7 @@ from bitymi_ns.sample.room import Room
 from tests.captures import edit, edit_frames, load_any, printed, write_cloud
 from tests.formats import PHOTOGRAPHS, blender, colmap, nerfstudio
 from tests.plugin.data.test_true_captures import move
+from tests.typed import Patch, Printed
 
 SIZE = (200, 150)
 TRIANGULATE = known_poses.triangulate  # before fixtures patch it
@@ -41,14 +42,14 @@ def arc(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def triangulating(monkeypatch: pytest.MonkeyPatch) -> None:
+def triangulating(monkeypatch: Patch) -> None:
     monkeypatch.setattr("bitymi_ns.capture.known_poses.triangulate", TRIANGULATE)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mirrored", [False, True])
 def test_points_are_triangulated_once(
-    arc: Path, tmp_path: Path, triangulating: None, mirrored: bool, capsys: pytest.CaptureFixture[str]
+    arc: Path, tmp_path: Path, triangulating: None, mirrored: bool, capsys: Printed
 ) -> None:
     capture = Path(shutil.copytree(arc, tmp_path / "arc"))
     if mirrored:
@@ -80,9 +81,7 @@ def test_masked_pixels_give_no_points(arc: Path, tmp_path: Path, triangulating: 
     assert len(local) > 10 and float((rows < 0.55 * SIZE[1]).double().mean()) > 0.9
 
 
-def test_what_cannot_be_triangulated(
-    arc: Path, tmp_path: Path, triangulating: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_cannot_be_triangulated(arc: Path, tmp_path: Path, triangulating: None, capsys: Printed) -> None:
     capture = Path(shutil.copytree(arc, tmp_path / "arc"))
     for i in range(6):
         Image.new("RGB", SIZE, (40 * i, 0, 0)).save(capture / f"images/{i}.png")
@@ -93,7 +92,7 @@ def test_what_cannot_be_triangulated(
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[Photograph]]:
+def asked(monkeypatch: Patch) -> list[list[Photograph]]:
     """Record the arguments of a stubbed triangulation, which returns two points."""
     calls: list[list[Photograph]] = []
 
@@ -111,9 +110,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[list[Photograph]]:
 
 
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
-def test_every_format_without_points(
-    capture: Path, form: Any, asked: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_format_without_points(capture: Path, form: Any, asked: list[Any], capsys: Printed) -> None:
     place = form(capture)
     if form is colmap:
         (place / "points3D.txt").unlink()
@@ -142,9 +139,7 @@ def test_triangulated_points_instead_of_those_of_the_capture(capture: Path, form
 
 
 @pytest.mark.parametrize("form", [nerfstudio, blender])
-def test_a_cloud_that_nothing_names(
-    capture: Path, form: Any, asked: list[Any], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cloud_that_nothing_names(capture: Path, form: Any, asked: list[Any], capsys: Printed) -> None:
     """The triangulated points lie on a plane."""
     place = form(capture)
     edit(place, lambda meta: meta.pop("ply_file_path", None))
@@ -166,7 +161,7 @@ def test_a_cloud_that_nothing_names(
     assert len(load_any(capture, points="triangulate").train_dataparser_outputs.metadata["points3D_xyz"]) == 2
 
 
-def test_photographs_that_color_points_are_read_reduced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_photographs_that_color_points_are_read_reduced(tmp_path: Path, monkeypatch: Patch) -> None:
     Image.new("RGB", (1600, 1200), (10, 200, 30)).save(tmp_path / "a.jpg")
     sizes: list[Any] = []
 
@@ -182,7 +177,7 @@ def test_photographs_that_color_points_are_read_reduced(tmp_path: Path, monkeypa
     assert (found[2] == points.GREY).all()
 
 
-def test_points_without_colors_get_those_of_the_photographs(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_points_without_colors_get_those_of_the_photographs(capture: Path, capsys: Printed) -> None:
     points = read_cloud(capture / "sparse_pc.ply", "")[0].xyz
     with_colors = load_any(capture).train_dataparser_outputs.metadata["points3D_rgb"].float()
     write_cloud(capture / "sparse_pc.ply", points, None)

@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.captures import add_masks, edit, edit_frames, expect, images_of, load_any, printed, save_masks
 from tests.formats import colmap, instant_ngp, nerfstudio, polycam
+from tests.typed import Patch, Printed
 
 LEFT = np.uint8(np.arange(48) < 24)[None].repeat(36, 0) * 255
 
@@ -39,9 +40,7 @@ def scanned(capture: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp, blender, colmap, scanned])
-def test_a_folder_of_masks_beside_the_photographs(
-    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_masks_beside_the_photographs(capture: Path, form: Callable[[Path], Path], capsys: Printed) -> None:
     save_masks(capture, LEFT)
     place = form(capture)
     place = capture if form is colmap else place
@@ -54,7 +53,7 @@ def test_a_folder_of_masks_beside_the_photographs(
 
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp])
-def test_masks_of_instant_ngp(capture: Path, form: Any, capsys: pytest.CaptureFixture[str]) -> None:
+def test_masks_of_instant_ngp(capture: Path, form: Any, capsys: Printed) -> None:
     """They are white on moving objects; a photograph without one is not masked."""
     form(capture)
     for path in images_of(capture)[2:4]:
@@ -70,9 +69,7 @@ def test_masks_of_instant_ngp(capture: Path, form: Any, capsys: pytest.CaptureFi
     assert "mask" not in train[0] and "(a mask of instant-ngp)" in printed(capsys)
 
 
-def test_a_folder_with_some_of_the_masks_or_of_something_else(
-    capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_with_some_of_the_masks_or_of_something_else(capture: Path, capsys: Printed) -> None:
     save_masks(capture, LEFT)
     (capture / "masks/frame_00003.png").unlink()
     with expect("has no mask of frame_00003.png. .*--use-masks False"):
@@ -84,7 +81,7 @@ def test_a_folder_with_some_of_the_masks_or_of_something_else(
     assert "Not taken for photographs" in (text := printed(capsys)) and "masks (masks: 1; " in text
 
 
-def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeypatch: Patch) -> None:
     add_masks(capture, 255)
     edit(capture, lambda meta: meta.pop("ply_file_path"))
     monkeypatch.setattr("bitymi_ns.capture.read._Reader._points", None)  # not reached
@@ -106,9 +103,7 @@ def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeyp
 
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp, blender, colmap])
-def test_pictures_that_nothing_names_are_named(
-    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_pictures_that_nothing_names_are_named(capture: Path, form: Callable[[Path], Path], capsys: Printed) -> None:
     place = form(capture)
     place = capture if form is colmap else place
     folder = next(path for path in (capture / "images", capture / "train") if path.is_dir())
@@ -146,9 +141,7 @@ def test_masks_by_their_names_on_another_machine(capture: Path, place: str) -> N
     assert len(manager.eval_dataset) == 1  # the mask of the first photograph, which is held out, is black
 
 
-def test_masks_of_photographs_without_a_pose_are_nothing_to_speak_of(
-    project: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_masks_of_photographs_without_a_pose_are_nothing_to_speak_of(project: Path, capsys: Printed) -> None:
     images = project / "sparse/0/images.txt"
     images.write_text(images.read_text().partition("\n\n")[2])
     for folder, ending in (("images", "_mask.png"), ("masks", ".png")):

@@ -13,6 +13,7 @@ from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.data.dataset import RECENT, BitymiDataset
 from bitymi_ns.sample import generate
 from tests.captures import edit, load_any
+from tests.typed import Patch
 
 WIDTH, HEIGHT = 48, 36
 PICTURE = WIDTH * HEIGHT * 3
@@ -28,7 +29,7 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def alive(monkeypatch: pytest.MonkeyPatch) -> Any:
+def alive(monkeypatch: Patch) -> Any:
     """Count the pictures read and those still alive."""
     pictures: weakref.WeakSet = weakref.WeakSet()
     reads: list[int] = []
@@ -58,7 +59,7 @@ def look_at_all(manager: BitymiDataManager, pictures: Any) -> int:
     return most
 
 
-def test_only_so_many_pictures_are_held(many: Path, alive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_so_many_pictures_are_held(many: Path, alive: Any, monkeypatch: Patch) -> None:
     monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 6 * PICTURE)
     pictures, _ = alive
     # the cache, the latest of both sets, and the caller's
@@ -73,7 +74,7 @@ def test_a_small_capture_is_read_once(many: Path, alive: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("distortion", [{}, {"k1": 0.05, "p1": 0.01}])
 def test_pixels_and_cameras_are_the_same(
-    many: Path, distortion: dict[str, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    many: Path, distortion: dict[str, float], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     capture = tmp_path / "many"
     capture.symlink_to(many) if not distortion else generate(capture, views=12, width=WIDTH, height=HEIGHT, points=50)
@@ -93,7 +94,7 @@ def test_pixels_and_cameras_are_the_same(
     assert read.train_dataset.cameras.distortion_params is None
 
 
-def test_one_step_reads_its_photograph_once(many: Path, alive: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_step_reads_its_photograph_once(many: Path, alive: Any, monkeypatch: Patch) -> None:
     monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 0)
     manager = load_any(many)
     _ = manager.cached_train
@@ -104,9 +105,7 @@ def test_one_step_reads_its_photograph_once(many: Path, alive: Any, monkeypatch:
     assert len(reads) == before + 1
 
 
-def test_a_photograph_that_cannot_be_read_is_noticed_at_the_start(
-    capture: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_photograph_that_cannot_be_read_is_noticed_at_the_start(capture: Path, monkeypatch: Patch) -> None:
     monkeypatch.setattr(module, "PHOTOGRAPH_BYTES", 0)
     path = sorted((capture / "images").iterdir())[3]
     path.write_bytes(path.read_bytes()[:200])

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, rotations
 from tests.captures import edit, load, printed
+from tests.typed import Printed
 
 
 def pose_of(frame: dict[str, Any]) -> np.ndarray:
@@ -28,7 +28,7 @@ def change_poses(capture: Path, change: Any, only: int | None = None) -> None:
     edit(capture, apply)
 
 
-def test_rounded_matrices_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_rounded_matrices_are_taken(capsys: Printed) -> None:
     exact = Rotation.random(50, random_state=0).as_matrix()
     names = list(range(50))
     four = exact.round(4)
@@ -40,9 +40,7 @@ def test_rounded_matrices_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
     assert np.array_equal(rotations(single, names, "here"), single)
 
 
-def test_a_mirrored_capture_is_taken_and_a_mirrored_frame_is_named(
-    capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mirrored_capture_is_taken_and_a_mirrored_frame_is_named(capture: Path, capsys: Printed) -> None:
     change_poses(capture, lambda part: part * [-1, 1, 1])
     c2w = load(capture).train_dataset.cameras.camera_to_worlds
     assert (torch.linalg.det(c2w[:, :, :3]) < 0).all() and "mirrored against the other" not in printed(capsys)
@@ -52,7 +50,7 @@ def test_a_mirrored_capture_is_taken_and_a_mirrored_frame_is_named(
     assert message.count("mirrored against") == 1
 
 
-def test_groups_of_cameras_are_neither_a_mistake_nor_another_unit(capsys: pytest.CaptureFixture[str]) -> None:
+def test_groups_of_cameras_are_neither_a_mistake_nor_another_unit(capsys: Printed) -> None:
     generator = np.random.default_rng(0)
     tripod, walk = 1e-4 * generator.normal(size=(30, 3)), 5.0 + generator.normal(size=(10, 3))
     check_outliers(np.concatenate([tripod, walk]), list(range(40)))

@@ -18,6 +18,7 @@ from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.export.trained import world_of
 from tests.captures import edit, edit_frames, expect, images_of, load_any, printed, save_masks, write_cloud
 from tests.formats import JSON, PHOTOGRAPHS, blender, colmap, instant_ngp, nerfstudio
+from tests.typed import Printed
 
 UTM = np.array([500123.0, 4649876.0, 312.0])
 
@@ -57,9 +58,7 @@ def move(place: Path, shift: np.ndarray) -> None:
 
 @pytest.mark.parametrize("centred", ["poses", "none"])
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
-def test_coordinates_of_a_map(
-    capture: Path, form: Callable[[Path], Path], centred: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_coordinates_of_a_map(capture: Path, form: Callable[[Path], Path], centred: str, capsys: Printed) -> None:
     place = form(capture)
     move(place, np.zeros(3))
     fixed = form in (instant_ngp, blender)
@@ -125,7 +124,7 @@ FISHEYE = {"camera_model": "OPENCV_FISHEYE", "fl_x": 14.0, "fl_y": 14.0, "k1": 0
 @pytest.mark.parametrize("which", ["all frames", "some frames", "top"])
 @pytest.mark.parametrize("form", JSON)
 def test_a_camera_model_wherever_it_stands(
-    capture: Path, form: Callable[[Path], Path], which: str, capsys: pytest.CaptureFixture[str]
+    capture: Path, form: Callable[[Path], Path], which: str, capsys: Printed
 ) -> None:
     place = form(capture)
 
@@ -175,7 +174,7 @@ def test_a_frame_with_a_camera_of_its_own(capture: Path) -> None:
 
 
 def test_names_of_a_model_that_lead_elsewhere_are_those_of_photographs_in_the_capture(
-    project: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    project: Path, tmp_path: Path, capsys: Printed
 ) -> None:
     images = project / "sparse/0/images.txt"
     text = images.read_text()
@@ -241,9 +240,7 @@ def test_what_needs_no_photographs_opens_none(capture: Path, form: Callable[[Pat
 
 
 @pytest.mark.parametrize("lacking", ["all", "some"])
-def test_held_out_views_of_blender_without_photographs(
-    capture: Path, lacking: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_held_out_views_of_blender_without_photographs(capture: Path, lacking: str, capsys: Printed) -> None:
     place = blender(capture)
     meta = json.loads(place.read_text())
     frames, test = meta["frames"][:8], meta["frames"][8:]
@@ -263,7 +260,7 @@ def test_held_out_views_of_blender_without_photographs(
 
 @pytest.mark.parametrize("form", [instant_ngp, blender])
 def test_millimetres_where_the_format_has_no_scale(
-    capture: Path, form: Callable[[Path], Path], capsys: pytest.CaptureFixture[str]
+    capture: Path, form: Callable[[Path], Path], capsys: Printed
 ) -> None:
     path = form(capture)
     load_any(capture)

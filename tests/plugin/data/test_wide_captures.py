@@ -14,6 +14,7 @@ from bitymi_ns.capture.lens import FACES
 from bitymi_ns.plugin.data.facts import CaptureFacts
 from bitymi_ns.plugin.data.views import with_lenses
 from tests.captures import as_binary, colmap_model, edit, edit_frames, expect, held_out, images_of, load_any, printed
+from tests.typed import Printed
 
 SIZE = (96, 48)
 
@@ -29,7 +30,7 @@ def panoramas(capture: Path, count: int) -> list[str]:
     return names
 
 
-def test_a_capture_of_both_kinds(capture: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_capture_of_both_kinds(capture: Path, capsys: Printed) -> None:
     names = panoramas(capture, 3)
     manager = load_any(capture, eval_interval=2)
     said = printed(capsys)
@@ -55,9 +56,7 @@ def test_only_panoramas_need_no_focal_length(capture: Path) -> None:
     assert len(manager.eval_dataset) == 6 * ((len(images_of(capture)) + 7) // 8)
 
 
-def test_a_mask_goes_with_each_face_and_a_face_without_pixels_is_left_out(
-    capture: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_mask_goes_with_each_face_and_a_face_without_pixels_is_left_out(capture: Path, capsys: Printed) -> None:
     count = len(images_of(capture))
     panoramas(capture, count)
     mask = np.full(SIZE[::-1], 255, np.uint8)
@@ -137,9 +136,7 @@ def rig_of_two(project: Path, form: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["txt", "bin"])
-def test_what_a_rig_took_together_is_held_out_together(
-    project: Path, form: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_rig_took_together_is_held_out_together(project: Path, form: str, capsys: Printed) -> None:
     rig_of_two(project, form)
     names = [path.name for path in images_of(project)]
     manager = load_any(project, eval_interval=4)

@@ -4,6 +4,7 @@ Those of files turn the room itself into one; those of scanning programs write a
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.captures import colmap_model, edit
 
+Form = Callable[[Path], Path]
 Y_UP = np.array([[0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """From a world with z up to ARKit's axes."""
 

@@ -3,14 +3,15 @@
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
 from bitymi_ns import __main__, cli
+from tests.typed import Patch, Printed
 
 
-def test_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_sample(tmp_path: Path, capsys: Printed) -> None:
     args = ["sample", "--output-dir", str(tmp_path / "room"), "--views", "1", "--width", "16", "--height", "12"]
     assert cli.main(args) == 0
     assert (tmp_path / "room" / "transforms.json").is_file()
@@ -30,7 +31,7 @@ def test_sample(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
         (["report"], "bitymi: nothing to report"),
     ],
 )
-def test_mistakes_are_a_line(tmp_path: Path, words: list[str], error: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_a_line(tmp_path: Path, words: list[str], error: str, capsys: Printed) -> None:
     (tmp_path / "file").write_text("")
     assert cli.main([word.format(tmp_path) for word in words]) == 1
     said = capsys.readouterr().err
@@ -56,12 +57,7 @@ FULL = "{} cannot be written: the disk is full: free some space, or write to ano
     [(OSError(28, "No space left on device"), 1, FULL), (KeyboardInterrupt(), 130, "interrupted")],
 )
 def test_a_full_disk_and_ctrl_c_are_named(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    problem: Any,
-    status: int,
-    error: str,
+    tmp_path: Path, monkeypatch: Patch, capsys: Printed, problem: BaseException, status: int, error: str
 ) -> None:
     def failing(*args: object, **kwargs: object) -> None:
         raise problem
@@ -74,7 +70,7 @@ def test_a_full_disk_and_ctrl_c_are_named(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["a\x1b[2Jb", "\udcff", "\rx"])
-def test_names_do_not_control_the_terminal(tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str) -> None:
+def test_names_do_not_control_the_terminal(tmp_path: Path, capsys: Printed, name: str) -> None:
     (tmp_path / name).touch()
     shown = name.encode("unicode_escape").decode()
     for command in ("sfm", "verify", "report", "view", "pack", "extras"):
@@ -86,16 +82,10 @@ def test_names_do_not_control_the_terminal(tmp_path: Path, capsys: pytest.Captur
     assert shown in capsys.readouterr().out
 
 
-def test_report_calls_build(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_report_calls_build(tmp_path: Path, monkeypatch: Patch) -> None:
     import bitymi_ns.measure.report.page
 
-    seen = {}
-
-    def build(inputs: tuple[Path, ...], output_dir: Path, title: str = "") -> Path:
-        seen.update(inputs=inputs, output_dir=output_dir, title=title)
-        return output_dir / "index.html"
-
-    monkeypatch.setattr(bitymi_ns.measure.report.page, "build", build, raising=False)
+    build = Mock(return_value=tmp_path / "index.html")
+    monkeypatch.setattr(bitymi_ns.measure.report.page, "build", build)
     assert cli.main(["report", "a.json", "b.json", "--output-dir", str(tmp_path), "--title", "Two"]) == 0
-    expected = {"inputs": (Path("a.json"), Path("b.json")), "output_dir": tmp_path, "title": "Two"}
-    assert seen == expected
+    build.assert_called_once_with((Path("a.json"), Path("b.json")), tmp_path, "Two")

@@ -53,20 +53,6 @@ def test_rows_that_a_header_only_claims_take_no_memory(tmp_path: Path, form: str
         tracemalloc.stop()
 
 
-def test_rows_with_lists_and_those_behind_them_are_refused(tmp_path: Path) -> None:
-    header = read_header(written(tmp_path / "a.ply", "binary_big_endian", more="property list uchar int tags\n"))
-    assert header.elements["vertex"].row is None and header.elements["vertex"].names[-1] == "tags"
-    with pytest.raises(PlyError, match="have lists"):
-        read_rows(tmp_path / "a.ply", header, "vertex")
-
-
-def test_a_line_that_is_no_row(tmp_path: Path) -> None:
-    path = written(tmp_path / "a.ply", "ascii")
-    path.write_bytes(path.read_bytes().replace(b"255", b"2.5"))
-    with pytest.raises(PlyError, match="line 16 is not x .float32., red .uint8., y .int16., but '2.5 2.5 4'"):
-        read_rows(path, read_header(path), "vertex")
-
-
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [

@@ -39,13 +39,16 @@ def start(room: Path, tmp_path: Path) -> Callable[..., BitymiTrainerConfig]:
     return make
 
 
-@pytest.fixture(scope="session")
-def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
-    """A finished run with all its checkpoints. Not to be changed."""
-    config = small_run(room, tmp_path_factory.mktemp("outputs"))
+def finished(config: BitymiTrainerConfig) -> BitymiTrainerConfig:
     config.save_only_latest_checkpoint = False
     ns_train.main(config)
     return config
+
+
+@pytest.fixture(scope="session")
+def trained(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
+    """A finished run with all its checkpoints. Not to be changed."""
+    return finished(small_run(room, tmp_path_factory.mktemp("outputs")))
 
 
 @pytest.fixture(scope="session")
@@ -60,10 +63,7 @@ def bundle(trained: BitymiTrainerConfig, tmp_path_factory: pytest.TempPathFactor
 @pytest.fixture(scope="session")
 def field_run(room: Path, tmp_path_factory: pytest.TempPathFactory) -> BitymiTrainerConfig:
     """A finished run with a field and all its checkpoints. Not to be changed."""
-    config = small_run(room, tmp_path_factory.mktemp("outputs"), method="bitymi-field")
-    config.save_only_latest_checkpoint = False
-    ns_train.main(config)
-    return config
+    return finished(small_run(room, tmp_path_factory.mktemp("outputs"), method="bitymi-field"))
 
 
 @pytest.fixture(scope="session")
@@ -71,6 +71,12 @@ def field_bundle(field_run: BitymiTrainerConfig, tmp_path_factory: pytest.TempPa
     folder = tmp_path_factory.mktemp("bundles") / "field-bc7"
     run_export(field_run, folder, tolerance=TOLERANCE, finetune_steps=0)
     return folder
+
+
+@pytest.fixture
+def capture(room: Path, tmp_path: Path) -> Path:
+    """A copy of the room, to be changed."""
+    return Path(shutil.copytree(room, tmp_path / "capture"))
 
 
 @pytest.fixture

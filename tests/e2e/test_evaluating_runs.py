@@ -30,13 +30,6 @@ def test_evaluation_refuses_a_damaged_or_missing_checkpoint(trained: BitymiTrain
         eval_setup(folder / "config.yml")
 
 
-def test_evaluation_refuses_a_checkpoint_of_another_preset(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
-    folder = a_run_of(trained, tmp_path)
-    rewrite(folder, lambda config: setattr(config.pipeline.model.scene, "view_color", "sg"))
-    with pytest.raises(InputError, match="another preset:\n.*view-color: sv there, sg here"):
-        eval_setup(folder / "config.yml")
-
-
 def test_evaluation_of_a_resumed_run_takes_its_own_checkpoint(trained: BitymiTrainerConfig, tmp_path: Path) -> None:
     folder = a_run_of(trained, tmp_path)
     rewrite(folder, lambda config: setattr(config, "load_step", 7))  # of the run it resumed from

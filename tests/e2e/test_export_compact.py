@@ -6,7 +6,6 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.bundle import check_files, read_bundle
-from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.trained import check_run
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
@@ -54,24 +53,3 @@ def test_it_can_be_as_small_as_is_asked_for(trained: Run, tmp_path: Path) -> Non
     bounded = sizes("c", finetune_steps=30, target_mb=target / 1e6)
     assert scene(bounded) < scene(free) and sum(bounded.values()) <= target
     assert len(read_bundle(tmp_path / "c")) == len(read_bundle(tmp_path / "b"))
-
-
-@pytest.mark.parametrize(
-    "options, said",
-    [
-        ({"format": "compact", "exact": True}, "needs a tolerance"),
-        ({"interchange": True}, "--interchange is for --format compact, and this bundle's is bc7"),
-        ({"target_mb": 1.0}, "--target-mb is for"),
-        ({"compact_error": 0.2}, "--compact-error is for"),
-        ({"format": None, "compact_error": 0.0}, "--compact-error must lie"),
-        ({"format": "fp16", "target_psnr": 30.0}, "--target-psnr is for .* fp16"),
-        ({"format": None, "target_psnr": 200.0}, "--target-psnr must be from"),
-        ({"format": None, "target_mb": 0.0}, "takes from 0.01 to 100,000 MB.*--target-mb"),
-        ({"format": None, "target_psnr": 30.0, "target_mb": 1.0}, "together"),
-        ({"format": None, "bc7_profile": "basic"}, "bc7_profile is for the format bc7, and this bundle's is compact"),
-        ({"format": None, "exact": True, "interchange": True}, "this bundle's is bc7"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(trained: Run, tmp_path: Path, options, said) -> None:
-    with pytest.raises(InputError, match=said):
-        run_export(trained, tmp_path / "b", **options)

@@ -9,8 +9,9 @@ from bitymi_ns.bake import pipeline as bake_pipeline
 from bitymi_ns.bake import tuning_views
 from bitymi_ns.bundle import check_files
 from bitymi_ns.plugin.export import command
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from bitymi_ns.plugin.run.config import BitymiTrainerConfig as Run
 from tests.e2e.exports import TOLERANCE, run_export
+from tests.typed import Patch, Printed
 
 
 def interrupted(*args: Any, **kwargs: Any) -> None:
@@ -18,37 +19,28 @@ def interrupted(*args: Any, **kwargs: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    "module, function, options, replaces, message",
+    "where, options, message",
     [
-        (tuning_views, "photometric", {"tolerance": TOLERANCE}, False, "was not written"),
-        (bake_pipeline, "trained_texels", {}, False, "was not written"),
-        (bake_pipeline, "trained_texels", {"overwrite": True}, True, "is the earlier one"),
-        (command, "compare", {"finetune_steps": 0}, False, "is complete"),
+        ((tuning_views, "photometric"), {"tolerance": TOLERANCE}, "was not written"),
+        ((bake_pipeline, "trained_texels"), {}, "was not written"),
+        ((bake_pipeline, "trained_texels"), {"overwrite": True}, "is the earlier one"),
+        ((command, "compare"), {"finetune_steps": 0}, "is complete"),
     ],
     ids=["fine-tuning", "bake", "bake of a replacement", "comparison"],
 )
 def test_ctrl_c_leaves_nothing_half_written_and_the_message_names_what_is_there(
-    module: Any,
-    function: str,
-    options: dict[str, Any],
-    replaces: bool,
-    message: str,
-    request: pytest.FixtureRequest,
-    trained: BitymiTrainerConfig,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    where: Any, options: Any, message: str, trained: Run, copied: Path, monkeypatch: Patch, capsys: Printed
 ) -> None:
-    folder = request.getfixturevalue("copied") if replaces else tmp_path / "b"
-    monkeypatch.setattr(module, function, interrupted)
+    folder = copied if "overwrite" in options else copied.with_name("b")
+    monkeypatch.setattr(*where, interrupted)
     with pytest.raises(SystemExit) as stop:
         run_export(trained, folder, **options)
     assert stop.value.code == 130 and message in " ".join(capsys.readouterr().out.split())
     if message == "was not written":
-        assert list(tmp_path.iterdir()) == []
+        assert list(copied.parent.iterdir()) == [copied]
     else:
         bundle = check_files(folder)[0]
-        assert bundle is not None and (bundle.info.statistics.held_out is None) == (module is command)
+        assert bundle is not None and (bundle.info.statistics.held_out is None) == (message == "is complete")
 
 
 @pytest.mark.parametrize(
@@ -60,13 +52,7 @@ def test_ctrl_c_leaves_nothing_half_written_and_the_message_names_what_is_there(
     ],
 )
 def test_ctrl_c_while_a_bundle_is_replaced_says_which_one_is_there(
-    trained: BitymiTrainerConfig,
-    copied: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    call: str,
-    name: str,
-    state: str,
+    trained: Run, copied: Path, monkeypatch: Patch, capsys: Printed, call: str, name: str, state: str
 ) -> None:
     before = (copied / "bundle.json").read_bytes()
     do = getattr(Path, call)

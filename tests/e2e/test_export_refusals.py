@@ -54,6 +54,17 @@ def test_a_folder_that_is_no_bundle_is_never_replaced(trained: Run, tmp_path: Pa
         ({"r_max": 8192}, "do not fit pages"),
         ({"seed": -1}, "seed must be greater than or equal to 0, not -1"),
         ({"r_min": 5}, "cannot be baked: .*power of two"),
+        ({"format": "compact", "exact": True}, "needs a tolerance"),
+        ({"interchange": True}, "--interchange is for --format compact, not bc7"),
+        ({"target_mb": 1.0}, "--target-mb is for"),
+        ({"compact_error": 0.2}, "--compact-error is for"),
+        ({"format": None, "compact_error": 0.0}, "--compact-error must lie"),
+        ({"format": "fp16", "target_psnr": 30.0}, "--target-psnr is for .* fp16"),
+        ({"format": None, "target_psnr": 200.0}, "--target-psnr must be from"),
+        ({"format": None, "target_mb": 0.0}, "takes from 0.01 to 100,000 MB.*--target-mb"),
+        ({"format": None, "target_psnr": 30.0, "target_mb": 1.0}, "cannot be combined"),
+        ({"format": None, "bc7_profile": "basic"}, "bc7_profile is for the format bc7, and this bundle's is compact"),
+        ({"format": None, "exact": True, "interchange": True}, "--interchange is for --format compact, not bc7"),
     ],
 )
 def test_wrong_options_are_found_early(

@@ -1,8 +1,6 @@
 """Exposure corrections through nerfstudio's entry points: checkpoints, export, messages."""
 
 import json
-import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,32 +13,29 @@ from bitymi_ns.bake import pipeline
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.plugin.export.command import ExportAtlas
 from bitymi_ns.plugin.run.callbacks import FILE
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
+from tests.captures import images_of, printed
 from tests.e2e.exports import evaluate
-from tests.e2e.runs import checkpoint, different
-
-Start = Callable[..., BitymiTrainerConfig]
+from tests.e2e.runs import Start, checkpoint, different
+from tests.typed import Patch, Printed
 
 
 @pytest.fixture
-def uneven(room: Path, tmp_path: Path) -> Path:
+def uneven(capture: Path) -> Path:
     """The room with every other photograph darkened to 0.7."""
-    folder = Path(shutil.copytree(room, tmp_path / "uneven"))
-    for path in sorted((folder / "images").iterdir())[::2]:
+    for path in images_of(capture)[::2]:
         Image.open(path).point(lambda value: round(0.7 * value)).save(path)
-    return folder
+    return capture
 
 
 def test_a_resumed_run_goes_on_with_its_corrections(
-    uneven: Path, start: Start, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    uneven: Path, start: Start, capsys: Printed, monkeypatch: Patch, tmp_path: Path
 ) -> None:
     whole, resumed = (start(data=uneven, name=name) for name in ("whole", "resumed"))
     whole.save_only_latest_checkpoint = False
     for config in (whole, resumed):
         config.pipeline.model.train.exposure, config.pipeline.model.train.lr.exposure = "gain", (0.05, 0.02)
     ns_train.main(whole)
-    said = " ".join(capsys.readouterr().out.split())
-    assert "The exposure of each photograph is learned" in said and "as asked for" in said
+    assert "The exposure of each photograph is learned" in (said := printed(capsys)) and "as asked for" in said
     state = checkpoint(whole, 59)["pipeline"]["_model._extra_state"]["run"]["exposure"]
     table = state["table"]
     assert table.shape == (10, 3) and table.abs().max() > 0.02

@@ -1,9 +1,8 @@
 """Refined poses through nerfstudio's entry points: checkpoints, resume, the bundle's cameras, ns-eval."""
 
 import json
-import shutil
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,26 +11,24 @@ from nerfstudio.scripts import train as ns_train
 from bitymi_ns.bundle.parts import CAMERAS
 from bitymi_ns.plugin.export.trained import load_trained
 from bitymi_ns.plugin.run.callbacks import FILE
-from bitymi_ns.plugin.run.config import BitymiTrainerConfig
 from bitymi_ns.train.poses import moved
+from tests.captures import edit_frames
 from tests.e2e.exports import TOLERANCE, evaluate, run_export
-from tests.e2e.runs import checkpoint, different
-
-Start = Callable[..., BitymiTrainerConfig]
+from tests.e2e.runs import Start, checkpoint, different
 
 
 @pytest.fixture
-def askew(room: Path, tmp_path: Path) -> Path:
+def askew(capture: Path) -> Path:
     """The room with poses that are a pixel off."""
-    folder = Path(shutil.copytree(room, tmp_path / "askew"))
-    file, generator = folder / "transforms.json", torch.Generator().manual_seed(0)
-    meta = json.loads(file.read_text())
-    for frame in meta["frames"]:
+    generator = torch.Generator().manual_seed(0)
+
+    def move(frame: dict[str, Any]) -> None:
         pose = torch.tensor(frame["transform_matrix"], dtype=torch.float64)
         motion = 0.02 * torch.randn(6, dtype=torch.float64, generator=generator)
         frame["transform_matrix"] = torch.linalg.inv(moved(torch.linalg.inv(pose), motion)).tolist()
-    file.write_text(json.dumps(meta))
-    return folder
+
+    edit_frames(capture, move)
+    return capture
 
 
 def test_poses_are_refined_resumed_exported_and_judged(askew: Path, start: Start, tmp_path: Path) -> None:

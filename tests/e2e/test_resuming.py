@@ -151,18 +151,9 @@ def test_resuming_elsewhere_cleans_up_the_killed_run(trained: Run, start: Start,
     assert not [p.name for p in killed.iterdir() if p.name.startswith(".")]
 
 
-def test_checkpoints_that_are_missing_or_damaged(trained: Run, start: Start, tmp_path: Path) -> None:
+def test_optimisers_that_do_not_fit_are_not_resumed(trained: Run, start: Start, tmp_path: Path) -> None:
     config = start()
-    config.load_dir = tmp_path / "nowhere"
-    with pytest.raises(InputError, match="there is no checkpoint folder"):
-        ns_train.main(copy.deepcopy(config))
-    config.load_dir.mkdir()
-    with pytest.raises(InputError, match="holds no checkpoint"):
-        ns_train.main(copy.deepcopy(config))
-    whole = (trained.get_checkpoint_dir() / "step-000000059.ckpt").read_bytes()
-    (config.load_dir / "step-000000059.ckpt").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="damaged"):
-        ns_train.main(copy.deepcopy(config))
+    config.load_dir = tmp_path
     state = checkpoint(trained, 59)
     del state["optimizers"]["means"]["param_groups"]
     torch.save(state, config.load_dir / "step-000000059.ckpt")

@@ -1,71 +1,31 @@
 """Folders of runs: exclusive use, full disks, read-only disks."""
 
 import copy
-import errno
 import json
 import shutil
-import subprocess
-import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-import torch
 from nerfstudio.scripts import train as ns_train
 
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.run import folder_lock
 from bitymi_ns.plugin.run.config import BitymiTrainerConfig
-from tests.e2e.runs import Start, checkpoint
-
-
-def test_a_full_disk_keeps_the_earlier_checkpoint(start: Start, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = start(name="full")
-    save = torch.save
-
-    def full_after_the_first(state: Any, file: Any) -> None:
-        if isinstance(state, dict) and state.get("step", 0) > 20:
-            file.write(b"half")
-            raise OSError(errno.ENOSPC, "No space left on device")
-        save(state, file)
-
-    monkeypatch.setattr(torch, "save", full_after_the_first)
-    with pytest.raises(InputError, match="could not be written: the disk is full(.|\n)*Resume with --load-dir"):
-        ns_train.main(config)
-    assert [p.name for p in config.get_checkpoint_dir().iterdir()] == ["step-000000020.ckpt"]
-    assert not [p for p in config.get_base_dir().iterdir() if "unfinished" in p.name]
-    assert checkpoint(config, 20)["step"] == 20
-
-
-HOLDS = """
-import sys
-from pathlib import Path
-from bitymi_ns.plugin.run import folder_lock
-
-folder_lock.take(Path(sys.argv[1]))
-print("has it", flush=True)
-sys.stdin.read()
-"""
+from tests.captures import expect
+from tests.e2e.runs import Start
+from tests.files.test_files import another_process
 
 
 def test_a_folder_takes_one_run_at_a_time(start: Start) -> None:
     config = start(name="run")
     config.max_num_iterations = 2
     folder = config.get_base_dir()
-    other = subprocess.Popen(
-        [sys.executable, "-c", HOLDS, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert other.stdout is not None and other.stdout.readline() == "has it\n"
-        with pytest.raises(
-            InputError, match=f"is in use: process {other.pid} is writing there(.|\n)*--timestamp"
-        ) as stop:
+    folder.mkdir(parents=True)
+    with another_process("locks.Lock(path)", folder / folder_lock.LOCK) as other:
+        with expect(f"is in use: process {other.pid} is writing there(.|\n)*--timestamp") as stop:
             ns_train.main(copy.deepcopy(config))
         assert stop.value.code != 0 and [p.name for p in folder.iterdir()] == [".lock"]  # untouched
-    finally:
-        other.kill()
-        other.communicate()
     (folder / ".step-000000001.ckpt.unfinished").write_text("of the run that was killed")
     ns_train.main(config)
     assert not [p.name for p in folder.iterdir() if p.name.startswith(".")]

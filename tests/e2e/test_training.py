@@ -1,7 +1,6 @@
 """Training through nerfstudio's entry point: results, every method, initial points."""
 
 import json
-import shutil
 from operator import attrgetter
 from pathlib import Path
 from typing import Any
@@ -109,38 +108,33 @@ def test_every_method_trains_and_loads_again(start: Start, method: str) -> None:
     assert images["img"].shape == (36, 96, 3)
 
 
-@pytest.fixture
-def spoiled(room: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(room, tmp_path / "spoiled"))
-
-
-def test_nan_points_are_left_out_and_counted(spoiled: Path, start: Start, capsys: Printed) -> None:
+def test_nan_points_are_left_out_and_counted(capture: Path, start: Start, capsys: Printed) -> None:
     points = np.random.default_rng(0).uniform(-1.0, 1.0, (200, 3))
     points[3:8] = np.nan
-    write_cloud(spoiled / "sparse_pc.ply", points)
-    config = start(data=spoiled)
+    write_cloud(capture / "sparse_pc.ply", points)
+    config = start(data=capture)
     config.max_num_iterations = 2
     ns_train.main(config)
     out = " ".join(capsys.readouterr().out.split())
     assert "5 of 200 points" in out
     assert "Training will take" in out and "GB of memory for 10 training photographs of 48 x 36" in out
-    write_cloud(spoiled / "sparse_pc.ply", np.full((200, 3), np.nan))
+    write_cloud(capture / "sparse_pc.ply", np.full((200, 3), np.nan))
     with pytest.raises(InputError, match="all 200 points .* are NaN"):
-        ns_train.main(start(data=spoiled, name="nan"))
+        ns_train.main(start(data=capture, name="nan"))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("empty", [False, True])
-def test_no_points_start_at_random(spoiled: Path, start: Start, capsys: Printed, empty: bool) -> None:
+def test_no_points_start_at_random(capture: Path, start: Start, capsys: Printed, empty: bool) -> None:
     if empty:
-        write_cloud(spoiled / "sparse_pc.ply", np.empty((0, 3)))
+        write_cloud(capture / "sparse_pc.ply", np.empty((0, 3)))
     else:
-        edit(spoiled, lambda meta: meta.pop("ply_file_path"))
-    config = start(data=spoiled)
+        edit(capture, lambda meta: meta.pop("ply_file_path"))
+    config = start(data=capture)
     config.max_num_iterations, config.pipeline.model.train.random_points = 2, 300
     ns_train.main(config)
     assert "Surfels are made of 300 random points" in " ".join(capsys.readouterr().out.split())
-    config = start(data=spoiled, name="box")
+    config = start(data=capture, name="box")
     config.pipeline.datamanager.dataparser.scene_scale = 0.0
     with pytest.raises(InputError, match="scene box of the capture, .*, is empty. .*--scene-scale"):
         ns_train.main(config)

@@ -18,10 +18,10 @@ from bitymi_ns.safe_reading import read_text
 WAITS = """
 import sys
 from pathlib import Path
-from bitymi_ns import files
+from bitymi_ns import files, locks
 
 path = Path(sys.argv[1])
-with files.{call}:
+with {call}:
     print("has it", flush=True)
     sys.stdin.read()
 """
@@ -29,7 +29,7 @@ with files.{call}:
 
 @contextmanager
 def another_process(call: str, path: Path) -> Iterator[subprocess.Popen]:
-    """Run a process within `with files.<call>` until it is killed."""
+    """Run a process within `with <call>` until it is killed."""
     code = WAITS.format(call=call)
     process = subprocess.Popen(
         [sys.executable, "-c", code, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -55,7 +55,7 @@ def test_a_kill_at_any_step_leaves_the_old_or_the_new_and_nothing_else(kind: str
     assert done.stdout.count("kills") == 2
 
 
-@pytest.mark.parametrize("call", ["complete_folder(path)", "reserved(path, lambda: None)"])
+@pytest.mark.parametrize("call", ["files.complete_folder(path)", "files.reserved(path, lambda: None)"])
 def test_a_folder_has_one_writer_and_the_next_one_cleans_up(tmp_path: Path, call: str) -> None:
     with another_process(call, tmp_path / "b") as process:
         before = names(tmp_path)
@@ -70,7 +70,7 @@ def test_a_folder_has_one_writer_and_the_next_one_cleans_up(tmp_path: Path, call
 
 
 def test_an_unfinished_file_is_removed_when_its_process_has_ended(tmp_path: Path) -> None:
-    with another_process("complete_file(path)", tmp_path / "f"):
+    with another_process("files.complete_file(path)", tmp_path / "f"):
         files.remove_unfinished(tmp_path)
         assert names(tmp_path) == [".f.unfinished"]
         with pytest.raises(locks.Busy, match="another process is writing it"):

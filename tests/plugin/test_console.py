@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("nerfstudio")
-
 import yaml
 from nerfstudio.scripts import train as ns_train
 from rich.console import Console

@@ -8,9 +8,6 @@ from types import ModuleType, SimpleNamespace
 from typing import Annotated, Any, Union
 
 import pytest
-
-pytest.importorskip("nerfstudio")
-
 import tyro
 from nerfstudio.configs import external_methods
 from nerfstudio.scripts.viewer import run_viewer

@@ -8,9 +8,6 @@ import warnings
 from pathlib import Path
 
 import pytest
-
-pytest.importorskip("nerfstudio")
-
 import torch
 import tyro
 import yaml

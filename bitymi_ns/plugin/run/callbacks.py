@@ -141,7 +141,7 @@ class TrainingRun:
                 "axes are x right, y up, z back)."
             )
         if empty:
-            warn(f"{listed(empty)} sees no point: the pose may be wrong, or the point cloud has none there.")
+            warn(f"{listed(empty)} sees no initial point: the pose may be wrong, or the point cloud has none there.")
 
     def callbacks(self) -> list[TrainingCallback]:
         return [

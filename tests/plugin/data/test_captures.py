@@ -23,13 +23,6 @@ from tests.stand_in_card import CARD
 from tests.typed import Patch
 
 
-def test_every_eighth_image_is_held_out_and_cached_without_cuda(capture: Path) -> None:
-    manager = load(capture)
-    assert (len(manager.train_dataset), len(manager.eval_dataset)) == (10, 2)
-    image = manager.cached_train[0]["image"]
-    assert image.shape == (36, 48, 3) and image.dtype == torch.uint8
-
-
 def test_the_order_of_views_depends_on_seed_and_step_alone(capture: Path) -> None:
     manager, other = load(capture), load(capture)
     order = [manager.train_index(step) for step in range(25)]

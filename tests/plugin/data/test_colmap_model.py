@@ -1,6 +1,5 @@
 """COLMAP models as other programs and editors write them."""
 
-import resource
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -83,19 +82,6 @@ def synthetic() -> pycolmap.Reconstruction:
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions(num_rigs=2, num_cameras_per_rig=2, num_frames_per_rig=9, num_points3D=50)
     return pycolmap.synthesize_dataset(options)
-
-
-@pytest.mark.parametrize("size", [100, 1000, 20_000])
-def test_a_model_that_is_not_written_whole(tmp_path: Path, size: int, synthetic: pycolmap.Reconstruction) -> None:
-    write_model(synthetic, tmp_path)
-    assert len(read_model(tmp_path).images) == len(synthetic.images)
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            write_model(synthetic, tmp_path)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
 @pytest.mark.parametrize("name", ["rigs", "cameras", "frames", "images", "points3D"])

@@ -20,7 +20,8 @@ from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.run.config import method_config
 from bitymi_ns.ply import write_cloud
 from tests.captures import edit, edit_frames, load_any, printed
-from tests.formats import JSON, SCANS, colmap, scannet, stray_scanner
+from tests.formats import JSON, SCANS, Form, colmap, scannet, stray_scanner
+from tests.typed import Patch, Printed
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
@@ -43,7 +44,7 @@ def capture(large_room: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def decided(monkeypatch: pytest.MonkeyPatch) -> Callable[[], str]:
+def decided(monkeypatch: Patch) -> Callable[[], str]:
     """A function that returns the reading that matches decided, once, and of which there were enough."""
     decisions, decide = [], readings.decide
     monkeypatch.setattr(readings, "decide", lambda *given: decisions.append(decide(*given)) or decisions[-1])
@@ -92,7 +93,7 @@ def of_scan(capture: Path, change: Change) -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize("form", [*JSON, model, *SCANS, stray_scanner])
 def test_right_ones_are_nothing_to_speak_of(
-    capture: Path, form: Callable[[Path], Path], decided: Callable[[], str], capsys: pytest.CaptureFixture[str]
+    capture: Path, form: Form, decided: Callable[[], str], capsys: Printed
 ) -> None:
     place = form(capture)
     load_any(capture if place.is_relative_to(capture) else place)
@@ -116,11 +117,7 @@ def test_right_ones_are_nothing_to_speak_of(
     ],
 )  # fmt: skip
 def test_others_are_read_as_meant(
-    capture: Path,
-    write: Callable[[Path], Path],
-    name: str,
-    decided: Callable[[], str],
-    capsys: pytest.CaptureFixture[str],
+    capture: Path, write: Form, name: str, decided: Callable[[], str], capsys: Printed
 ) -> None:
     right = load_any(capture, poses_as="written").train_dataset.cameras.camera_to_worlds
     data = write(capture)

@@ -17,6 +17,7 @@ from tests.captures import as_binary, edit, edit_frames, expect, images_of, load
 from tests.changes import SPOILT, Change, beside, cloud, content, entries, entry, given, matrices, pose, room_of, text
 from tests.formats import (
     PHOTOGRAPHS,
+    Form,
     blender,
     colmap,
     instant_ngp,
@@ -281,7 +282,7 @@ SPOILT_FILES: list[tuple[Any, str, Change, str]] = [
     *((nerfstudio, "", undecodable(ending), f"frame_00004.{ending}") for ending in ("png", "jpg", "webp", "tif")),
     *((colmap, "../../train_list.txt", SPOILT[kind], "own lists|train_list.txt") for kind in ("binary", "deep")),
 ]  # fmt: skip
-DEFECTS: list[tuple[Callable[[Path], Path], str, Change, str]] = [
+DEFECTS: list[tuple[Form, str, Change, str]] = [
     *((form, "", lambda place: [file.rename(file.with_name(file.name.replace("frame_", "fr\u0430me_")))  # Cyrillic
                                 for file in images_of(room_of(place))],
        r"(?s)but there is \S*fr\u0430me_\d+.png, '\S*fr\\u0430me_\d+.png', instead of '\S*frame_\d+.png'")
@@ -316,9 +317,7 @@ DEFECTS: list[tuple[Callable[[Path], Path], str, Change, str]] = [
 
 @pytest.mark.usefixtures("no_hang")
 @pytest.mark.parametrize(("form", "file", "change", "message"), DEFECTS)
-def test_a_defect_is_named(
-    capture: Path, form: Callable[[Path], Path], file: str, change: Change, message: str
-) -> None:
+def test_a_defect_is_named(capture: Path, form: Form, file: str, change: Change, message: str) -> None:
     place = form(capture)
     stated = change(place / file if file else place)
     options = {"format": {nerfstudio: "nerfstudio", instant_ngp: "instant-ngp"}.get(form, "auto")}

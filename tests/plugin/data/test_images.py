@@ -17,7 +17,6 @@ from bitymi_ns.capture.image_files import ImageSummary, read_image, summarize
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from tests.captures import add_masks, edit, expect, images_of, load, load_with, printed, refused
-from tests.profiles import DISPLAY_P3
 
 
 @pytest.fixture
@@ -207,9 +206,3 @@ def test_photographs_beyond_all_sizes(capture: Path, index: int) -> None:
     declared(path, 60000, 60000)
     with expect(f"{path.name} has more than 1,000,000,000 pixels. Make it smaller"):
         checked(capture)
-
-
-def test_colors_are_those_of_screens(tmp_path: Path) -> None:
-    Image.new("RGB", (8, 8), (200, 100, 80)).save(tmp_path / "a.png", icc_profile=DISPLAY_P3)
-    red, green, _ = read_image(tmp_path / "a.png").getpixel((2, 2))
-    assert red > 205 and green < 100

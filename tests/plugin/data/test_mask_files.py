@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import pytest
 from PIL import Image
 
 from tests.captures import add_masks, edit, edit_frames, expect, images_of, load_any, printed, save_masks
-from tests.formats import colmap, instant_ngp, nerfstudio, polycam
+from tests.formats import Form, colmap, instant_ngp, nerfstudio, polycam
 from tests.typed import Patch, Printed
 
 LEFT = np.uint8(np.arange(48) < 24)[None].repeat(36, 0) * 255
@@ -40,7 +39,7 @@ def scanned(capture: Path) -> Path:
 
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp, blender, colmap, scanned])
-def test_a_folder_of_masks_beside_the_photographs(capture: Path, form: Callable[[Path], Path], capsys: Printed) -> None:
+def test_a_folder_of_masks_beside_the_photographs(capture: Path, form: Form, capsys: Printed) -> None:
     save_masks(capture, LEFT)
     place = form(capture)
     place = capture if form is colmap else place
@@ -103,7 +102,7 @@ def test_masks_are_checked_before_points_are_triangulated(capture: Path, monkeyp
 
 
 @pytest.mark.parametrize("form", [nerfstudio, instant_ngp, blender, colmap])
-def test_pictures_that_nothing_names_are_named(capture: Path, form: Callable[[Path], Path], capsys: Printed) -> None:
+def test_pictures_that_nothing_names_are_named(capture: Path, form: Form, capsys: Printed) -> None:
     place = form(capture)
     place = capture if form is colmap else place
     folder = next(path for path in (capture / "images", capture / "train") if path.is_dir())

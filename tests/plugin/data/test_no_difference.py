@@ -15,7 +15,8 @@ from PIL import Image
 
 from tests.captures import colmap_model, edit, edit_frames, images_of, load_any, printed, write_cloud
 from tests.changes import SPOILT, Change, beside, cloud, content, entries, entry, given, matrices, pose, room_of, text
-from tests.formats import JSON, PHOTOGRAPHS, blender, colmap, instant_ngp, nerfstudio, scannet
+from tests.formats import JSON, PHOTOGRAPHS, Form, blender, colmap, instant_ngp, nerfstudio, scannet
+from tests.typed import Patch, Printed
 
 CAMERA_ENTRIES = ("camera_to_worlds", "fx", "fy", "cx", "cy", "width", "height")
 
@@ -107,7 +108,7 @@ NAMES = {
     "unicode": lambda name: unicodedata.normalize("NFD", name),
 }
 OTHER_NAMES = "12 of 12 photographs have other names than it says"
-SAME: list[tuple[Callable[[Path], Path], str, Change, str]] = [
+SAME: list[tuple[Form, str, Change, str]] = [
     *((form, "", names(change), "" if what in ("backslashes", "no ending") else OTHER_NAMES)
       for form in PHOTOGRAPHS for what, change in NAMES.items()),
     *((form, "", encoded(encoding), "") for form in JSON for encoding in ("utf-8-sig", "utf-16")),
@@ -131,17 +132,12 @@ SAME: list[tuple[Callable[[Path], Path], str, Change, str]] = [
     (nerfstudio, "", cloud("points\\Cloud.ply"), ""),
     (nerfstudio, "", cloud("/home/me/room/points/cloud.ply"), ""),
 ]  # fmt: skip
-BEFORE: dict[Callable[[Path], Path], list[torch.Tensor]] = {}  # what the room gives in each format
+BEFORE: dict[Form, list[torch.Tensor]] = {}  # what the room gives in each format
 
 
 @pytest.mark.parametrize(("form", "file", "change", "said"), SAME)
 def test_what_makes_no_difference(
-    capture: Path,
-    form: Callable[[Path], Path],
-    file: str,
-    change: Change,
-    said: str,
-    capsys: pytest.CaptureFixture[str],
+    capture: Path, form: Form, file: str, change: Change, said: str, capsys: Printed
 ) -> None:
     def views() -> list[torch.Tensor]:
         manager = load_any(capture)
@@ -161,7 +157,7 @@ def test_what_makes_no_difference(
 
 
 UNIT = "The point cloud seems to be in another unit than the poses: half of the points lie"
-SAID: list[tuple[Callable[[Path], Path], str, Change, str]] = [
+SAID: list[tuple[Form, str, Change, str]] = [
     *((form, "", entry(lambda meta: (meta.update(fisheye_crop_radius=12.0), meta["frames"][2].update(rotation=0.1))),
        "that are not used: fisheye_crop_radius.") for form in JSON),
     *((form, "", elsewhere, "names pictures outside of its folder, which are read there: ") for form in JSON),
@@ -192,14 +188,7 @@ SAID: list[tuple[Callable[[Path], Path], str, Change, str]] = [
 
 
 @pytest.mark.parametrize(("form", "file", "change", "said"), SAID)
-def test_what_is_said(
-    capture: Path,
-    form: Callable[[Path], Path],
-    file: str,
-    change: Change,
-    said: str,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_what_is_said(capture: Path, form: Form, file: str, change: Change, said: str, capsys: Printed) -> None:
     place = form(capture)
     data = capture if place.is_relative_to(capture) else place
     assert len(load_any(data).train_dataset) == 10 and said not in printed(capsys)
@@ -211,11 +200,7 @@ def test_what_is_said(
 @pytest.mark.parametrize("data", [".", "../room"])
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
 def test_a_capture_is_read_from_within_as_from_elsewhere(
-    capture: Path,
-    form: Callable[[Path], Path],
-    data: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capture: Path, form: Form, data: str, monkeypatch: Patch, capsys: Printed
 ) -> None:
     form(capture)
     (capture / "notes").mkdir()

@@ -14,7 +14,6 @@ from bitymi_ns.bundle.manifest import Manifest
 from bitymi_ns.capture.frame import WorldFrame, write_frame
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.plugin.export.trained import world_of
-from bitymi_ns.plugin.run.folder_lock import keep_poses_report
 from tests.bake.conftest import surfels
 from tests.bake.scenes import write
 from tests.captures import colmap_model, found_poses, images_of, load_any
@@ -106,10 +105,3 @@ def test_a_capture_that_came_with_its_poses_states_neither(
     stated = bundled(manager, surfels, tmp_path / "bundle").world.model_dump()
     assert set(stated) == {"transform", "scale"}
     assert torch.tensor(stated["transform"]).shape == (3, 4)
-
-
-def test_a_report_that_cannot_be_kept_does_not_stop_the_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    write_frame(tmp_path, frame())
-    (tmp_path / "run").write_text("a file in its place")
-    keep_poses_report(tmp_path / "run", tmp_path)
-    assert "is not kept with the run" in " ".join(capsys.readouterr().out.split())

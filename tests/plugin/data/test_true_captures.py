@@ -1,7 +1,6 @@
 """Captures that other programs misread or fail to read; each case in every format that can have it."""
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManag
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.export.trained import world_of
 from tests.captures import edit, edit_frames, expect, images_of, load_any, printed, save_masks, write_cloud
-from tests.formats import JSON, PHOTOGRAPHS, blender, colmap, instant_ngp, nerfstudio
+from tests.formats import JSON, PHOTOGRAPHS, Form, blender, colmap, instant_ngp, nerfstudio
 from tests.typed import Printed
 
 UTM = np.array([500123.0, 4649876.0, 312.0])
@@ -58,7 +57,7 @@ def move(place: Path, shift: np.ndarray) -> None:
 
 @pytest.mark.parametrize("centred", ["poses", "none"])
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
-def test_coordinates_of_a_map(capture: Path, form: Callable[[Path], Path], centred: str, capsys: Printed) -> None:
+def test_coordinates_of_a_map(capture: Path, form: Form, centred: str, capsys: Printed) -> None:
     place = form(capture)
     move(place, np.zeros(3))
     fixed = form in (instant_ngp, blender)
@@ -99,7 +98,7 @@ CAMERA = {"w": 40, "h": 30, "fl_x": 44.0, "fl_y": 46.0, "cx": 21.0, "cy": 14.0}
 
 @pytest.mark.parametrize("at_top", [True, False])
 @pytest.mark.parametrize("form", JSON)
-def test_every_entry_of_a_camera_is_used(capture: Path, form: Callable[[Path], Path], at_top: bool) -> None:
+def test_every_entry_of_a_camera_is_used(capture: Path, form: Form, at_top: bool) -> None:
     """Blender's own export has them beside camera_angle_x, which is of the longer side."""
     place = form(capture)
 
@@ -123,9 +122,7 @@ FISHEYE = {"camera_model": "OPENCV_FISHEYE", "fl_x": 14.0, "fl_y": 14.0, "k1": 0
 
 @pytest.mark.parametrize("which", ["all frames", "some frames", "top"])
 @pytest.mark.parametrize("form", JSON)
-def test_a_camera_model_wherever_it_stands(
-    capture: Path, form: Callable[[Path], Path], which: str, capsys: Printed
-) -> None:
+def test_a_camera_model_wherever_it_stands(capture: Path, form: Form, which: str, capsys: Printed) -> None:
     place = form(capture)
 
     def change(meta: dict[str, Any]) -> None:
@@ -191,7 +188,7 @@ def test_names_of_a_model_that_lead_elsewhere_are_those_of_photographs_in_the_ca
 
 
 @pytest.mark.parametrize("form", [nerfstudio, colmap])
-def test_a_name_as_long_as_the_system_allows(capture: Path, form: Callable[[Path], Path]) -> None:
+def test_a_name_as_long_as_the_system_allows(capture: Path, form: Form) -> None:
     place = form(capture)
     file = place / "images.txt" if place.is_dir() else place
     path = images_of(capture)[0]
@@ -220,7 +217,7 @@ def test_points_of_a_model_in_a_ply_file_alone(project: Path, empty: str | None)
 
 
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
-def test_reduced_as_they_are_read(capture: Path, form: Callable[[Path], Path]) -> None:
+def test_reduced_as_they_are_read(capture: Path, form: Form) -> None:
     """`--downscale-factor` without a folder of reduced copies is the same for every format."""
     manager = load_any(form(capture), downscale_factor=2)
     assert manager.cached_train[0]["image"].shape == (18, 24, 3)
@@ -228,7 +225,7 @@ def test_reduced_as_they_are_read(capture: Path, form: Callable[[Path], Path]) -
 
 
 @pytest.mark.parametrize("form", PHOTOGRAPHS)
-def test_what_needs_no_photographs_opens_none(capture: Path, form: Callable[[Path], Path]) -> None:
+def test_what_needs_no_photographs_opens_none(capture: Path, form: Form) -> None:
     form(capture)
     for path in images_of(capture):
         path.unlink()
@@ -259,9 +256,7 @@ def test_held_out_views_of_blender_without_photographs(capture: Path, lacking: s
 
 
 @pytest.mark.parametrize("form", [instant_ngp, blender])
-def test_millimetres_where_the_format_has_no_scale(
-    capture: Path, form: Callable[[Path], Path], capsys: Printed
-) -> None:
+def test_millimetres_where_the_format_has_no_scale(capture: Path, form: Form, capsys: Printed) -> None:
     path = form(capture)
     load_any(capture)
     assert "of this format usually lie" not in printed(capsys)

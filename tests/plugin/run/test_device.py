@@ -57,7 +57,6 @@ def test_why_a_card_is_not_used(card: ModuleType, monkeypatch: pytest.MonkeyPatc
 @pytest.fixture
 def config():
     """Make a run's configuration; nerfstudio is imported before the stub, as its libraries query a GPU."""
-    pytest.importorskip("nerfstudio")
     from bitymi_ns.plugin.run.config import method_config
 
     return method_config("bitymi").config

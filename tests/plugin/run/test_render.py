@@ -9,12 +9,9 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import av
 import numpy as np
 import pytest
-
-pytest.importorskip("nerfstudio")
-
-import av
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.scene_box import OrientedBox
@@ -61,10 +58,8 @@ class Wall(SurfelModel):
 @pytest.fixture
 def wall(monkeypatch: Patch) -> Wall:
     model = Wall()
-    for name in ("install_checks", "_render_trajectory_video", "get_crop_from_json", "VanillaDataManager", "media"):
-        monkeypatch.setattr(render, name, getattr(render, name))
-    for name in ("get_path_from_json", "get_interpolated_camera_path", "get_spiral_path", "gzip"):
-        monkeypatch.setattr(render, name, getattr(render, name))
+    for name, value in vars(render).items():
+        monkeypatch.setattr(render, name, value)  # undone at the end
 
     def eval_setup(*_: Any, **__: Any) -> tuple:
         patch_render()

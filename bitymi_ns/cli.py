@@ -72,7 +72,7 @@ class Sfm:
             say(f"left out: {name}: {why}")
         say(
             f"{poses.registered} of {poses.given} photographs have a pose; mean reprojection error "
-            f"{poses.reprojection_error:.2f} pixels. Report: {(self.output or poses.report) / 'report.md'}"
+            f"{poses.reprojection_error:.2f} pixels. Report: {(self.output or poses.report) / 'report.json'}"
         )
         if by_gps := gps_line(poses.report):
             say(by_gps)

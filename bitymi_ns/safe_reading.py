@@ -1,5 +1,4 @@
-"""Reading of untrusted files: only regular files are opened, sizes are checked before reading, and errors name the file
-and the entry."""
+"""Reading of untrusted files: only regular ones are opened, sizes are checked first, and errors name file and entry."""
 
 from __future__ import annotations
 
@@ -20,19 +19,18 @@ from .exit_messages import out_of_memory
 from .ranges import describe_problems
 from .trust import LONGEST, json_of
 
-MOST_TEXT = 1 << 30  # maximum size of JSON or text, bytes; 100,000 photographs need a tenth of it
+MOST_TEXT = 1 << 30  # most bytes of JSON or text; 100,000 photographs need a tenth of it
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file for reading, also through a link. A folder, pipe or device is refused before it is opened:
-    opening a pipe blocks. Raises OSError: the file does not exist, is not regular, or cannot be opened; `strerror` says
-    which."""
+    """Open a regular file for reading, also through a link; others are refused before they are opened, as opening a
+    pipe blocks. Raises OSError, whose `strerror` says why."""
     try:
         found = os.stat(path)
     except ValueError:  # a null character
         raise OSError(errno.EINVAL, "no file can have this name", str(path)) from None
     if stat.S_ISREG(found.st_mode):
-        # O_NONBLOCK: opening does not block even if it has become a pipe in the meantime
+        # O_NONBLOCK: it may have become a pipe
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
         if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             return file
@@ -49,7 +47,7 @@ def read_bytes(path: Path, most: int = MOST_TEXT) -> bytes:
 
 
 def open_text(path: Path, errors: str = "strict") -> TextIO:
-    """Open a text file in the encoding of its byte order mark (written by Windows programs), or else in UTF-8."""
+    """Open a text file in the encoding of its byte order mark (of Windows programs), or else in UTF-8."""
     file = open_regular(path)
     wide = file.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
     return TextIOWrapper(file, encoding="utf-16" if wide else "utf-8-sig", errors=errors)
@@ -100,12 +98,10 @@ def reading(
     advice: str = "",
     passing: tuple[type[BaseException], ...] = (),
 ) -> Iterator[None]:
-    """Convert any exception in the block, which reads untrusted data, to a one-line message of place and cause. All are
-    caught, because libraries raise many kinds on such data.
-
-    `what`: file and entry being read, as in "a.json: frame 3". `refuse`: raises the exception for a message and its
-    cause. `advice`: end of the message: what to do, unless memory ran out. `passing`: exceptions with such a message,
-    which are passed on."""
+    """Convert any exception in the block, which reads untrusted data, to a one-line message of place and cause. `what`:
+    file and entry being read, as in "a.json: frame 3". `refuse`: raises the exception for a message and its cause.
+    `advice`: end of the message: what to do, unless memory ran out. `passing`: exceptions with such a message, which
+    are passed on."""
     try:
         yield
     except passing:

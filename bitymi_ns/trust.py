@@ -1,5 +1,5 @@
-"""Protection against untrusted files: links are not followed, folders writable by others are not used, names cannot
-leave their folder, JSON depth is limited, text is escaped, and Python runs no module from the current folder."""
+"""Protection against untrusted files: links, folders writable by others, names that leave their folder, deep JSON,
+control characters, and modules in the current folder."""
 
 import errno
 import json
@@ -13,9 +13,9 @@ from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-UNFINISHED = ".unfinished"  # suffix of files being written, whose names begin with a dot; a killed process leaves them
-LONGEST = 1000  # maximum number of characters of a name in messages
-DEEPEST = 100  # maximum nesting depth of JSON
+UNFINISHED = ".unfinished"  # suffix of files being written, and left by killed processes
+LONGEST = 1000  # most characters of a name in messages
+DEEPEST = 100  # most nesting of JSON
 _CALL = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; from {0} import {1}; sys.exit({1}())"
 _CONTROLS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
 
@@ -31,9 +31,8 @@ class Refused(PermissionError):
 
 
 def no_links(name: str | os.PathLike[str], flags: int) -> int:
-    """Open or create a file for writing without following links; an opener for `open`. Raises Refused: it is a symbolic
-    or hard link, is no regular file, or belongs neither to the user nor to the folder's owner. Raises OSError: it
-    cannot be opened."""
+    """Open or create a file for writing, as an opener for `open`. Raises Refused: it is a symbolic or hard link, is no
+    regular file, or belongs neither to the user nor to the folder's owner."""
     path = Path(name)
     empty = flags & os.O_TRUNC
     flags = (flags | os.O_NOFOLLOW) & ~(os.O_CREAT | os.O_EXCL | os.O_TRUNC)
@@ -74,8 +73,7 @@ def _check_owner(path: Path, found: os.stat_result) -> None:
 
 
 def is_left(folder: Path) -> bool:
-    """Return True if a folder left by a killed process exists. Raises Refused: it is no folder, or is somebody
-    else's."""
+    """Test for a folder that a killed process left. Raises Refused: it is no folder, or somebody else's."""
     try:
         found = os.lstat(folder)
     except FileNotFoundError:
@@ -88,8 +86,8 @@ def is_left(folder: Path) -> bool:
 
 def own_folder(folder: Path, close: bool = False) -> None:
     """Create a folder, if missing, that only the user can write to; its parent is not checked. `close`: remove the
-    write permission of others from an existing folder, whose contents do not matter. Raises Refused: it belongs to
-    another user, is writable by others, or is a link. Raises OSError: it cannot be created."""
+    write permission of others from an existing folder, whose contents do not matter. Raises Refused: it is another
+    user's, others can write to it, or it is a link."""
     with suppress(FileExistsError):
         folder.mkdir(mode=0o755)
         close = True  # an ACL of the parent may have granted more rights
@@ -102,7 +100,7 @@ def own_folder(folder: Path, close: bool = False) -> None:
 
 
 def is_own(folder: Path) -> bool:
-    """Return True for a folder, not a link, that belongs to the user and only the user can write to."""
+    """Test for a folder, not a link, that belongs to the user and only the user can write to."""
     try:
         found = os.lstat(folder)
     except OSError:
@@ -111,7 +109,7 @@ def is_own(folder: Path) -> bool:
 
 
 def check_no_links(paths: Iterable[Path]) -> None:
-    """Check that no path, if it exists, is a link, symbolic or hard; archives can contain both. Raises Refused."""
+    """Check that no path, if it exists, is a link, symbolic or hard, as archives can contain. Raises Refused."""
     for path in paths:
         try:
             found = os.lstat(path)
@@ -146,10 +144,9 @@ def check_replaceable(
     refuse: Callable[[str], Exception],
     option: str = "--overwrite",
 ) -> None:
-    """Check that a folder is missing or empty, or holds an earlier result alone, which may be replaced; raise `refuse`
-    of a message if not. `what`: name of such a result in messages, e.g. "a bundle". `made`: names of all files of the
-    result in the folder, read after the other checks; None: it has none. `option`: command-line option that sets
-    `overwrite`."""
+    """Check that a folder is missing or empty, or holds an earlier result alone, which may be replaced; else raise
+    `refuse` of a message. `what`: such a result in messages, e.g. "a bundle"; `made`: names of all its files, read
+    after the other checks (None = there is no such result); `option`: command-line option that sets `overwrite`."""
     if not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not folder.is_dir():
@@ -172,7 +169,7 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def leads_inside(name: str) -> bool:
-    """Return True if a relative name stays inside its folder."""
+    """Test if a relative name stays inside its folder."""
     path = PurePosixPath(name)
     return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
@@ -211,12 +208,12 @@ def json_of(data: str | bytes) -> Any:
 
 
 def printable(text: str) -> str:
-    """Escape control characters, bidirectional controls and surrogates for a terminal; file names may contain them."""
+    """Escape control characters, bidirectional controls and surrogates for a terminal."""
     return _CONTROLS.sub(lambda found: found.group().encode("unicode_escape").decode(), text)
 
 
 def told_apart(paths: Sequence[Path]) -> list[str]:
-    """Name files, with as many of the folders above them as tell all of them apart."""
+    """Name files, with as many of the folders above them as tell all apart."""
     count = len(set(paths))
     for depth in range(1, max((len(path.parts) for path in paths), default=0) + 1):
         names = ["/".join(path.parts[-depth:]) for path in paths]
@@ -232,7 +229,7 @@ def listed(names: Sequence[object], most: int = 3) -> str:
 
 
 def is_text(name: str | os.PathLike[str]) -> bool:
-    """Return True if a file's name can be encoded as UTF-8."""
+    """Test if a file's name can be encoded as UTF-8."""
     try:
         os.fspath(name).encode()
     except UnicodeEncodeError:
@@ -241,11 +238,8 @@ def is_text(name: str | os.PathLike[str]) -> bool:
 
 
 def python_command(module: str, function: str) -> list[str]:
-    """Build a command that calls a function without arguments in a new process of this Python; the function returns the
-    exit status, and further words of the command are in `sys.argv`.
-
-    The current folder, which may be an untrusted capture, is removed from the search path: with `-m` or `-c` alone a
-    `json.py` in it would be run. `-P` does the same, but is missing in Python 3.10; `-I` would also hide the user's own
-    packages.
-    """
+    """Build a command that calls a function in a new process of this Python; the function returns the exit status, and
+    further words of the command are in `sys.argv`. The current folder, which may be an untrusted capture, is removed
+    from the search path: with `-m` or `-c` alone a `json.py` in it would be run. `-P` is missing in Python 3.10; `-I`
+    would also hide the user's own packages."""
     return [sys.executable, "-c", _CALL.format(module, function)]

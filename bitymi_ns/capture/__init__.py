@@ -9,14 +9,13 @@ if TYPE_CHECKING:
 
 
 def __getattr__(name: str) -> Any:
-    """Import `pycolmap` when it is first wanted, with the process's signal handlers kept: its import has SIGTERM, and
-    whatever ends a process by a fault, print a native stack."""
+    """Import `pycolmap` on first use and restore the signal handlers: its own print a native stack, also at SIGTERM."""
     if name != "pycolmap":
         raise AttributeError(name)
     sigaction, kept = ctypes.CDLL(None).sigaction, ctypes.create_string_buffer(256)  # larger than struct sigaction
-    handlers = [(each, kept.raw) for each in signal.valid_signals() if sigaction(int(each), None, kept) == 0]
+    handlers = [(number, kept.raw) for number in signal.valid_signals() if sigaction(int(number), None, kept) == 0]
     import pycolmap
 
-    for each, handler in handlers:
-        sigaction(int(each), handler, None)
+    for number, handler in handlers:
+        sigaction(int(number), handler, None)
     return globals().setdefault(name, pycolmap)

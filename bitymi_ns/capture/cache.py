@@ -1,4 +1,4 @@
-"""Cache folders of structure from motion, beside the photographs or in the user's cache, locked in use."""
+"""Cache folders of structure from motion."""
 
 import atexit
 import hashlib
@@ -17,16 +17,15 @@ from bitymi_ns.trust import Refused, check_no_links, is_own, own_folder
 from .types import CaptureError, fail
 
 FOLDER = ".bitymi"
-OF = "of.json"  # file in a work folder with its source and key
+OF = "of.json"  # file of a work folder's source and key
 Kind = Literal["poses", "points", "frames"]
-"""Content of a work folder, and the start of its name: poses, points of known poses, or frames of a video with known
-poses. A file of that name marks the latter two as complete."""
+"""Content of a work folder, and the start of its name. A file "points" or "frames" marks these as complete."""
 IN_USE = ".in-use-"  # prefix of the locks of reading processes
-VERSION = 6  # increase to invalidate cached poses when equal input gives others
+VERSION = 6  # increase when equal input gives other poses
 
 
 def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
-    """Hash names in the capture, sizes and modification times of files, and settings (plain values)."""
+    """Hash names, sizes and modification times of files, and plain values."""
     stats = [(name, path.stat()) for name, path in inputs]
     content = [VERSION, [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats], settings]
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
@@ -34,8 +33,8 @@ def content_key(inputs: Iterable[tuple[str, Path]], settings: object) -> str:
 
 @contextmanager
 def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -> Iterator[Path]:
-    """Make and lock the folder of this key in `.bitymi` beside the photographs (or video), else in the user's cache
-    folder. Raises CaptureError: another process works there, or neither can be written."""
+    """Make and lock the folder of a key beside the photographs (or video), else in the user's cache folder. Raises
+    CaptureError: another process works there, or neither can be written."""
     beside, cache = home(photographs), user_cache()
     problem: OSError | None = None
     for root in filter(None, (beside, cache)):
@@ -50,7 +49,7 @@ def work_folder(photographs: Path, key: str, tell: Tell, kind: Kind = "poses") -
             fail(f"{kind} of {photographs} are being found already: {error}", error)
         except OSError as error:
             if root == beside and isinstance(error, Refused):
-                tell(f"{error}. It is not used: the {kind} are kept in {cache or 'no place that is known'}.")
+                tell(f"{error}. The {kind} are kept in {cache or 'no place that is known'} instead.")
             problem = error
             continue
         with lock:
@@ -68,7 +67,7 @@ def home(photographs: Path) -> Path:
 
 
 def made_once(photographs: Path, key: str, kind: Kind, tell: Tell, make: Callable[[Path], None]) -> Path:
-    """Return the work folder of this key, filled once by `make`. Raises CaptureError: see `work_folder`."""
+    """Return the folder of this key, filled once by `make`; see `work_folder`."""
     for root in (home(photographs), user_cache()):
         if root is not None and is_own(root) and is_own(folder := root / f"{kind}-{key}"):
             with suppress(OSError):
@@ -84,12 +83,12 @@ def made_once(photographs: Path, key: str, kind: Kind, tell: Tell, make: Callabl
 
 
 def replace_stale(work: Path, photographs: Path, contents: str) -> None:
-    """Record the source of a locked work folder and the key of its files (`contents`), and remove the folders beside it
-    of earlier contents. Keep those of other options, on which runs were trained, and those in use."""
+    """Record the source of a work folder and the key of its files (`contents`), and remove the folders beside it of
+    earlier contents. Those of other options, on which runs were trained, and those in use stay."""
     source = os.path.relpath(os.path.realpath(photographs), os.path.realpath(work))  # relative: both may move
     write_file(work / OF, json.dumps({"source": source, "contents": contents}).encode())
     for folder in work.parent.glob(f"{work.name.partition('-')[0]}-*"):
-        # an OSError may also be the lock of a process that uses it
+        # OSError: also if a process holds the lock
         with suppress(OSError, ValueError, LookupError, TypeError):
             record = folder != work and is_own(folder) and read_json(folder / OF)
             if record and record["source"] == source and record["contents"] != contents:
@@ -108,15 +107,14 @@ def keep_work_folder(work: Path) -> None:
 
 
 def emptied(folder: Path) -> Path:
-    """Make an empty folder, or empty an existing one."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir()
     return folder
 
 
 def user_cache() -> Path | None:
-    """Return the user's cache folder; None = unknown."""
-    with suppress(RuntimeError):  # there is no HOME, and the system does not know the user
+    """Return the user's cache folder; None = the system knows no home."""
+    with suppress(RuntimeError):
         stated = os.environ.get("XDG_CACHE_HOME", "")
         return (Path(stated) if os.path.isabs(stated) else Path.home() / ".cache") / "bitymi-ns"
     return None

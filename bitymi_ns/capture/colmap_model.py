@@ -1,7 +1,5 @@
-"""COLMAP models on disk: cameras, poses and points in COLMAP's frame, checked by file and entry.
-
-pycolmap's reader accepts truncated files, ends names in text at the first space, and reads no model without points.
-"""
+"""Read COLMAP models and check every entry: pycolmap accepts truncated files, ends names in text at the first space,
+and reads no model without points."""
 
 import errno
 import functools
@@ -24,32 +22,30 @@ from .transforms import MAX_SIDE
 from .types import SPHERICAL_MODEL, ColmapCamera, fail, parsing, warn
 
 FORMS = (".txt", ".bin")
-MOST_MODEL = 1 << 36  # bytes of a file of a model; 100 million points take a twentieth of it
-PROBE = 1 << 20  # bytes to write to find out why writing failed
+MOST_MODEL = 1 << 36  # bytes of a file; 100 million points take a twentieth of it
+PROBE = 1 << 20
 TINY = 1e-100  # least length of a quaternion that can be normalised
 CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 
 
 class ModelImage(NamedTuple):
-    """Photograph: name, camera, world to camera (quaternion wxyz, translation), and its rig's frame; None = no rig."""
-
     name: str
     camera_id: int
-    qvec: npt.NDArray[np.float64]
+    qvec: npt.NDArray[np.float64]  # world to camera, wxyz
     tvec: npt.NDArray[np.float64]
-    frame: int | None = None
+    frame: int | None = None  # of its rig; None = no rig
 
 
 class Model(NamedTuple):
     cameras: dict[int, ColmapCamera]  # by number
     images: list[ModelImage]  # sorted by name
-    xyz: npt.NDArray[np.float64]  # [N, 3] float64 points
-    rgb: npt.NDArray[np.uint8]  # [N, 3] colors; [0, 3] without colors
-    without_colors: str = ""  # why they have none, in words that follow the file's name
+    xyz: npt.NDArray[np.float64]  # [N, 3] in COLMAP's world
+    rgb: npt.NDArray[np.uint8]  # [N, 3], or [0, 3] without colors
+    without_colors: str = ""  # why, in words that follow the file's name
 
 
 def read_model(folder: Path) -> Model:
-    """Read a model; of both forms the text, with a warning if they differ. Raises CaptureError: it cannot be used."""
+    """Read a model, of both forms the text; warn if they differ. Raises CaptureError: it cannot be used."""
     path = _file(folder, "cameras")
     cameras = dict(_parsed(path))
     _check_cameras(path, cameras)
@@ -57,7 +53,7 @@ def read_model(folder: Path) -> Model:
     images = dict(_parsed(path))
     _check_images(path, images, cameras)
     path = path.with_stem("frames")
-    if path.is_file():  # of COLMAP 4, whose images keep poses of their own
+    if path.is_file():  # of COLMAP 4
         frames = dict(_parsed(path))
         images = {number: image._replace(frame=frames.get(number)) for number, image in images.items()}
     _warn_of_other_form(folder, cameras, len(images))
@@ -70,99 +66,95 @@ def read_model(folder: Path) -> Model:
             first = f"the first is point {np.argmin(finite) + 1}"
             warn(f"{path}: {np.sum(~finite):,} of {len(xyz):,} points, {first}, are not finite. They are left out.")
             xyz, rgb = xyz[finite], rgb[finite] if len(rgb) else rgb
-    if not len(xyz) and (cloud := folder / "points3D.ply").is_file():  # by programs that read or made the model
+    if not len(xyz) and (cloud := folder / "points3D.ply").is_file():
         (xyz, rgb), without_colors = read_cloud(cloud, "Copy it again, or move it away to have points triangulated.")
-    # nerfstudio sorts paths, not text: sort alike to hold the same photographs out
+    # nerfstudio sorts paths, not text: alike, the same photographs are held out
     return Model(cameras, sorted(images.values(), key=lambda image: Path(image.name)), xyz, rgb, without_colors)
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in binary form, and read it back, because COLMAP ignores failed writes; not with COLMAP, whose
-    reader does not end on some truncated files. Raises OSError: a file is incomplete."""
+    """Write a model in binary form and read it back, as COLMAP ignores failed writes, and does not end reading some
+    truncated files. Raises OSError: a file is incomplete."""
     try:
         model.write_binary(folder)
         for name, read in BINARY.items():
             tuple(read(folder / f"{name}.bin"))
     except (ValueError, struct.error) as error:
-        for name in BINARY:  # COLMAP has lost the reason: write more to have it reported
+        for name in BINARY:  # write more to have the reason reported
             with open(folder / f"{name}.bin", "ab") as file:
                 file.write(bytes(PROBE))
                 file.flush()
                 os.fsync(file.fileno())
-        raise OSError(errno.EIO, os.strerror(errno.EIO), str(folder)) from error  # the reason no longer holds
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(folder)) from error
 
 
 def _file(folder: Path, name: str) -> Path:
-    """Choose the text or binary file of a model, of the form with cameras and images; a lone file is another's."""
+    """Choose the text or binary file of a model: of the form with cameras and images, else the text."""
 
     def is_complete(form: str) -> bool:
-        return all((folder / f"{each}{form}").is_file() for each in ("cameras", "images"))
+        return all((folder / f"{part}{form}").is_file() for part in ("cameras", "images"))
 
-    preferred = sorted(FORMS, key=is_complete, reverse=True)  # else the text first
+    preferred = sorted(FORMS, key=is_complete, reverse=True)
     return next((file for form in preferred if (file := folder / f"{name}{form}").is_file()), folder / f"{name}.bin")
 
 
 def _warn_of_other_form(folder: Path, cameras: dict[int, ColmapCamera], images: int) -> None:
-    """Warn if a binary model beside the text that is read differs from it."""
     if _file(folder, "images").suffix != ".txt" or not (folder / "images.bin").is_file():
         return
-    count, path = image_count(folder), folder / "cameras.bin"  # of the binary form
+    count, path = image_count(folder), folder / "cameras.bin"
     if count != images or (path.is_file() and dict(_parsed(path)) != cameras):
         warn(
             f"{folder} holds two models, of {images} images in text and {count} in binary form, or of other cameras. "
-            "The text is read. To have the binary one read, move cameras.txt, images.txt and points3D.txt away."
+            "The text is read: move cameras.txt, images.txt and points3D.txt away to have the binary one read."
         )
 
 
 def _parsed(path: Path) -> list[Any]:
-    """Parse a file of a model; report errors by its name."""
     if not os.path.lexists(path):
         fail(f"the COLMAP model lacks {path}. Copy the whole model: cameras, images and points3D.")
     hint = "It is cut off or damaged. " * (path.suffix == ".bin")
     hint += "Each image has two lines; the second, of its 2D points, may be empty. " * (path.name == "images.txt")
-    with parsing(path, f"{hint}Copy the model again, or export it from COLMAP again."):
+    with parsing(path, f"{hint}Copy or export the model again."):
         return list((TEXT if path.suffix == ".txt" else BINARY)[path.stem](path))
 
 
 @functools.cache
 def parameter_count(model: str) -> int | None:
-    """Count the parameters of a COLMAP camera model; None = COLMAP has no such model."""
+    """Count a camera model's parameters; None = COLMAP has no such model."""
     if model not in pycolmap.CameraModelId.__members__ or model == "INVALID":
         return None
     return len(pycolmap.Camera.create_from_model_name(1, model, 1.0, 1, 1).params)
 
 
 def _check_cameras(path: Path, cameras: dict[int, ColmapCamera]) -> None:
-    """Fail at sizes and parameters out of range, or not as many as the camera model has."""
     for number, camera in cameras.items():
         count = parameter_count(camera.model)
         if not all(1 <= side <= MAX_SIDE for side in camera.size) or not np.isfinite(camera.params).all():
             what = f"{path}: camera {number}, {' '.join(str(part)[:99] for part in camera)}, cannot be used"
-            fail(f"{what}: sides are 1 to {MAX_SIDE:,} pixels, numbers finite. Correct it, or export the model again.")
+            fail(f"{what}: sides are 1 to {MAX_SIDE:,} pixels, numbers finite. Correct it.")
         if len(camera.params) != count:
             what = f"camera {number} has {len(camera.params)} parameters, but a {camera.model} has {count}"
             fail(f"{path}: {what}. Correct its line.")
 
 
 def _check_images(path: Path, images: dict[int, ModelImage], cameras: dict[int, ColmapCamera]) -> None:
-    """Fail at images without usable pose or camera, and at two images of one name."""
     if not images:
         fail(f"{path} lists no images: COLMAP found no poses. Give another model with `--colmap-path`.")
     first: dict[str, int] = {}
     for number, image in images.items():
         if image.camera_id not in cameras:
             what = f"image {number} ({image.name}) is of camera {image.camera_id}, but the model has only"
-            fail(f"{path}: {what} {listed(sorted(cameras))}. Correct its line, or copy the model again.")
+            fail(f"{path}: {what} {listed(sorted(cameras))}. Correct its line.")
         if not np.isfinite([*image.qvec, *image.tvec]).all() or not TINY < np.linalg.norm(image.qvec) < 1.0 / TINY:
             what = f"the pose of image {number} ({image.name}) is not finite, or its rotation is zero"
             fail(f"{path}: {what}. Correct its line or remove the image.")
         if first.setdefault(image.name, number) != number:
             twice = f"images {first[image.name]} and {number} are both of {image.name}"
-            fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
+            fail(f"{path}: {twice}. Correct one or remove it.")
 
 
 class _Binary:
-    """Sequential reader of a binary file; fails if it has less than it states."""
+    """Sequential reader; raises errors if the file has less or more than it states."""
 
     def __init__(self, path: Path) -> None:
         self.data, self.offset = read_bytes(path, MOST_MODEL), 0
@@ -184,7 +176,6 @@ class _Binary:
         return text
 
     def rows(self) -> Iterator["_Binary"]:
-        """Yield itself at the start of every row; fails if there is more behind the last one."""
         for _ in range(self.take("Q")[0]):
             yield self
         if self.offset != len(self.data):
@@ -215,9 +206,8 @@ def _rigs_binary(path: Path) -> Iterator[int]:
 
 
 def _frames_binary(path: Path) -> Iterator[tuple[int, int]]:
-    """Yield image and frame of the images that a rig's cameras took together."""
     for file in _Binary(path).rows():
-        frame, *_, count = file.take("II7dI")  # with rig and pose
+        frame, *_, count = file.take("II7dI")  # rig and pose between
         for _ in range(count):
             sensor, _, number = file.take("iIQ")
             if sensor == CAMERA_SENSOR:
@@ -252,7 +242,7 @@ def _cameras_text(path: Path) -> Iterator[tuple[int, ColmapCamera]]:
 
 
 def _images_text(path: Path) -> Iterator[tuple[int, ModelImage]]:
-    """Parse images.txt, in which programs may leave out the second line of an image."""
+    """Parse images.txt; some programs leave out the second line of an image."""
     number = None
     for line in _lines(path):
         if number is not None and _are_observations(line):
@@ -281,7 +271,6 @@ def _frames_text(path: Path) -> Iterator[tuple[int, int]]:
 
 
 def _are_observations(line: str) -> bool:
-    """Test for an image's second line: triples of numbers, or nothing."""
     words = line.split()
     try:
         return len(words) % 3 == 0 and all(math.isfinite(float(word)) for word in words)
@@ -290,7 +279,6 @@ def _are_observations(line: str) -> bool:
 
 
 def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8], str]:
-    """Parse points3D.txt: positions, colors, and why there are no colors."""
     rows = [[float(word) for word in line.split(maxsplit=7)[1:7]] for line in _lines(path) if line]
     counts = {len(row) for row in rows}
     if not counts <= {3, 6} or len(counts) > 1:
@@ -301,6 +289,7 @@ def _points_text(path: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.ui
     return values[:, :3], *color_bytes(values[:, 3:], bool((values[:, 3:] % 1.0).any()))
 
 
+# Readers of files by name.
 Reader = Callable[[Path], Iterable[Any]]
 TEXT: dict[str, Reader] = {
     "cameras": _cameras_text, "frames": _frames_text, "images": _images_text, "points3D": _points_text,
@@ -309,4 +298,3 @@ BINARY: dict[str, Reader] = {
     "rigs": _rigs_binary, "cameras": _cameras_binary, "frames": _frames_binary, "images": _images_binary,
     "points3D": _points_binary,
 }  # fmt: skip
-"""Readers of a model's files by name."""

@@ -1,4 +1,4 @@
-"""Photographs of a COLMAP model: find their files, and convert poses and points to nerfstudio's frame."""
+"""Photographs, poses and points of a COLMAP model, in nerfstudio's frame."""
 
 import os
 from collections import Counter
@@ -21,32 +21,32 @@ from .recognise import Found
 from .types import OPENCV_AXES, Photograph, Pose, SfmSettings, fail, warn
 
 TO_Z_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""Transform [4, 4] from COLMAP's world, up about -y, to z up, as in nerfstudio's COLMAP parser."""
+"""[4, 4] from COLMAP's world (up about -y), as in nerfstudio's COLMAP parser."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Photographs or video that structure from motion was run on, recorded by a training run that keeps the model."""
+    """Input of structure from motion, which a training run records; paths are relative to the capture."""
 
     kind: Literal["photographs", "video"]
-    path: str  # folder that was searched for photographs, or the video, relative to the capture
-    photographs: str | None  # their folder, relative to the capture; None = temporary upright copies or frames
+    path: str  # folder of photographs, or video
+    photographs: str | None  # their folder; None = temporary upright copies or frames
     settings: SfmSettings | None = None  # None = unknown
 
 
 @dataclass(frozen=True)
 class Source:
-    """A COLMAP model and the photographs that belong to it."""
+    """A COLMAP model and its photographs."""
 
     model: Model = field(repr=False, compare=False)
     folder: Path  # of the model
-    photographs: Path  # folder to which names in the model are relative
-    left_out: Mapping[str, str] = field(default_factory=dict)  # photographs that the model lacks, and known reasons
-    report: Path | None = None  # folder of the report on structure from motion; None = none
+    photographs: Path  # to which names in the model are relative
+    left_out: Mapping[str, str] = field(default_factory=dict)  # photographs without a pose, and known reasons
+    report: Path | None = None  # folder of the report on structure from motion
     origin: Origin | None = None  # None = the capture came with the model
 
     def files(self) -> list[Path]:
-        """Find the files of the model's images; for a missing one, return the path that the model names."""
+        """Find the files of the model's images; missing ones have the stated path."""
         names = [image.name for image in self.model.images]
         finder = FileFinder(self.photographs)
         return [path or finder.missing(name) for path, name in zip(finder.find_all(names), names, strict=True)]
@@ -61,7 +61,7 @@ class Source:
 
 
 def find_source(found: Found, images: Path | None, downscale: int, need_photos: bool) -> Source:
-    """Find the photographs of a COLMAP model: at a stated path in the capture, else by searching it."""
+    """Read a COLMAP model, and find its photographs: at a stated path in the capture, else by searching it."""
     model = read_model(found.path)
     names = [image.name for image in model.images]
     photographs = _find_folder(names, found.path, found.folder, images, downscale, need_photos)
@@ -76,12 +76,12 @@ def find_source(found: Found, images: Path | None, downscale: int, need_photos: 
 def _find_folder(
     names: Sequence[str], folder: Path, capture: Path, stated: Path | None, downscale: int, need_photos: bool
 ) -> Path:
-    """Find the folder with most of a model's photographs: `stated`, else in `capture`; if that is the model's, also
-    three levels above it. Raises CaptureError: photographs are needed, and `stated` is missing or no folder has any."""
+    """Find the folder with most of a model's photographs: `stated`, else in `capture`, and three levels above if that
+    is the model's. Raises CaptureError: photographs are needed, and `stated` is missing or no folder has any."""
     if stated is not None:
         if not need_photos or (capture / stated).is_dir() or (capture / f"{stated}_{downscale}").is_dir():
             return capture / stated
-        advice = f"Give it, seen from {capture}, with --images-path, or leave that out to have it found."
+        advice = f"Correct --images-path, which is seen from {capture}, or leave it out."
         fail(f"the folder of photographs {capture / stated} does not exist. {advice}")
     bases = [capture, *(path for path in folder.parents if path.is_relative_to(capture) and path != capture)]
     bases += folder.parents[:3] if folder == capture else ()
@@ -91,21 +91,21 @@ def _find_folder(
 
     def most(path: Path, count: Callable[[Path], int]) -> int:
         copies = Path(f"{path}_{downscale}")
-        return max((count(each) for each in (path, copies) if each.is_dir()), default=0)
+        return max((count(place) for place in (path, copies) if place.is_dir()), default=0)
 
     portable = [name for name in names if leads_inside(name)]
-    exact = {path: most(path, lambda at: sum(os.path.isfile(at / name) for name in portable)) for path in folders}
+    exact = {path: most(path, lambda base: sum(os.path.isfile(base / name) for name in portable)) for path in folders}
     best = max(folders, key=exact.__getitem__)  # the first of equals
     if not need_photos or exact[best] == len(names):
         return best
-    # a folder above the capture may be the root of a disk, which is not searched
+    # a folder above the capture may be a whole disk
     searched = [path for path in exact if path.is_relative_to(capture) or path.name in USUAL_FOLDERS]
-    counts = {path: most(path, lambda at: len({*FileFinder(at).find_all(names)} - {None})) for path in searched}
+    counts = {path: most(path, lambda base: len({*FileFinder(base).find_all(names)} - {None})) for path in searched}
     fitting = max(counts, key=counts.__getitem__)
     if counts[fitting] > exact[best]:
         return fitting
     if exact[best] == 0:
-        near = [hint for each in searched if each.is_dir() and (hint := FileFinder(each).nearest(names[0], names))]
+        near = [hint for path in searched if path.is_dir() and (hint := FileFinder(path).nearest(names[0], names))]
         hint = f" ({near[0]})" if near else ""
         where = f"which are in none of the folders of {capture}{hint}"
         advice = "Copy them to its folder `images`, or give their folder: `bitymi-data --images-path`."
@@ -114,7 +114,7 @@ def _find_folder(
 
 
 def warn_left_out(source: Source) -> set[Path]:
-    """Report photographs that the model lacks or names differently; return the paths of all, in the model or not."""
+    """Report photographs that the model lacks or names differently; return the paths of all."""
     files = source.files()
     stated, folder = [image.name for image in source.model.images], source.photographs
     report_renamed(f"The COLMAP model {source.folder}", stated, files, folder)
@@ -131,7 +131,6 @@ def warn_left_out(source: Source) -> set[Path]:
 
 
 def photographs_of(source: Source) -> list[Photograph]:
-    """List the photographs of a model in the order of their names, with cameras and poses."""
     model, photographs = source.model, []
     for image, file in zip(model.images, source.files(), strict=True):
         w, *xyz = image.qvec / np.linalg.norm(image.qvec)
@@ -144,5 +143,4 @@ def photographs_of(source: Source) -> list[Photograph]:
 
 
 def model_points(model: Model, frame: Pose) -> Points:
-    """Transform a model's points by [4, 4] float64."""
     return Points(model.xyz @ frame[:3, :3].T + frame[:3, 3], model.rgb)

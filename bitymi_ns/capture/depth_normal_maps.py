@@ -1,4 +1,4 @@
-"""Read depth maps, their confidence, and normal maps, as programs and scanners write them."""
+"""Read maps of depth, confidence and normals, as programs and scanners write them."""
 
 import math
 import os
@@ -23,27 +23,25 @@ from .lens import Lens
 from .masks import in_proportion
 from .types import MAP_FILES, MapFiles, fail, parsing, warn
 
-MILLIMETER = 1e-3  # metres per unit of integer depth unless stated: nerfstudio's convention
-COLOR_SAMPLES = 8  # files of a folder of depth that are tested; if all are color pictures, it is not used
-MOST_LARGER = 8  # largest ratio of a map's side to its photograph's, which may be a reduced copy
-MOST_NUMBERS = 1 << 28  # most numbers of a map: 80 million normals, or 260 million depths
-FARTHEST = 65504.0  # depth from which on numbers mean "no depth": the largest half float, below Blender's 1e10
+MILLIMETER = 1e-3  # metres per unit of integer depth: nerfstudio's convention
+COLOR_SAMPLES = 8  # files of a folder of depth that are tested for being color pictures
+MOST_LARGER = 8  # largest ratio of a map's side to its photograph's, which may be reduced
+MOST_NUMBERS = 1 << 28  # of a map
+FARTHEST = 65504.0  # no depth from here on: the largest half float, below Blender's 1e10
 
-EXR_HEADER = 1 << 24  # bytes of a file in which its header ends
+EXR_HEADER = 1 << 24  # most bytes of a header
 EXR_ATTRIBUTES = ("channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio")
 
-Check = Callable[[tuple[int, ...]], None]  # receives a header's shape, and raises if it must not be read
+Check = Callable[[tuple[int, ...]], None]  # raises if an array of this shape must not be read
 TIFFS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-# a damaged map gets one message, without OpenCV's
+# damaged maps get our message only
 attrgetter("setLogLevel" if hasattr(cv2, "setLogLevel") else "utils.logging.setLogLevel")(cv2)(0)
-_PARSING = threading.Lock()  # ast.literal_eval, which numpy parses headers with, fails in threads of Python 3.11
+_PARSING = threading.Lock()  # numpy's ast.literal_eval fails in threads of Python 3.11
 
 Values = npt.NDArray[np.float32]
 
 
 def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
-    """Find depth and confidence by their names in a folder, without extensions."""
-
     def find(name: str) -> Path | None:
         files = (folder / f"{name}{ending}" for ending in MAP_FILES)
         return next((file for file in files if os.path.isfile(file)), None)
@@ -52,8 +50,8 @@ def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
 
 
 def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
-    """Find depth and confidence of a scanner's photographs: files of their names in `depth` and `confidence` beside
-    their folder (Polycam, Record3D, ScanNet). Warn of a folder of color pictures, which is not used."""
+    """Find maps by the photographs' names in `depth` and `confidence` beside their folder (Polycam, Record3D, ScanNet).
+    Warn of a folder of color pictures, which is not used."""
     maps = [maps_called(path.parent.parent, f"depth/{path.stem}", f"confidence/{path.stem}") for path in photographs]
     depths = [files.depth for files in maps if files.depth is not None]
     if depths and all(_is_color(depths[i]) for i in spread(len(depths), COLOR_SAMPLES)):
@@ -63,8 +61,8 @@ def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
 
 
 def _is_color(path: Path) -> bool:
-    """Test for an integer image whose channels differ, which is no depth."""
-    with suppress(Exception):  # libraries on damaged files; reported when they are read
+    """Test for an integer image whose channels differ."""
+    with suppress(Exception):  # damaged files are reported when they are read
         if path.suffix.lower() in (".png", ".tif", ".tiff") and math.prod(image_shape(path)) <= MOST_NUMBERS:
             values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
             return values is not None and values.ndim == 3 and values.dtype.kind in "iu" and _channels_differ(values)
@@ -77,8 +75,8 @@ def _channels_differ(values: npt.NDArray[Any]) -> bool:
 
 def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values:
     """Read camera z [H, W] for the pinhole picture of a lens, by nearest neighbors; 0 = unknown. Integers are
-    millimetres, floating-point numbers metres, unless `unit` gives metres; 0, the largest integer, numbers from 65,504
-    and a confidence of 0 mean unknown. Raises CaptureError: a file cannot be read, or has another shape."""
+    millimetres and floats metres, unless `unit` gives metres; 0, the largest integer, floats from FARTHEST and
+    confidence 0 mean unknown. Raises CaptureError: a file cannot be read, or has another shape."""
     assert files.depth is not None
     stored = _read(files.depth, lens.stored)
     if stored.ndim != 2:
@@ -95,8 +93,8 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
 
 def read_normal(files: MapFiles, lens: Lens) -> Values:
     """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown. Files hold
-    them in the camera frame of transforms.json (x right, y up, z back): floating-point numbers, or colors (n + 1) / 2
-    with black for unknown. Raises CaptureError: a file cannot be read, or has another shape than the photograph."""
+    them in the camera's OpenGL axes, as floats, or as colors (n + 1) / 2 with black for unknown. Raises CaptureError:
+    see `read_depth`."""
     assert files.normal is not None
     stored = _read(files.normal, lens.stored)
     if stored.ndim != 3 or stored.shape[2] < 3:
@@ -112,7 +110,8 @@ _WITHOUT = "Write it again, or train without: `bitymi-data --depth off`."
 
 
 def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.NDArray[Any]:
-    """Read an array [H, W] or [H, W, C] of RGB order; check its size, if `alike` also its shape, before."""
+    """Read an array [H, W] or [H, W, C] of RGB order, after a check of its size, if `alike` also of its aspect
+    ratio."""
 
     def check(shape: tuple[int, ...]) -> None:
         if len(shape) not in (2, 3) or min(shape) < 1:
@@ -122,7 +121,7 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
             fail(wrong_size(path, size, photograph))
         if max(size[0] / photograph[0], size[1] / photograph[1]) > MOST_LARGER or math.prod(shape) > MOST_NUMBERS:
             declares = f"{path} declares {' x '.join(map(str, shape))} numbers for a photograph of"
-            limits = f"at most {MOST_LARGER} times its sides, and {MOST_NUMBERS:,} numbers, are read"
+            limits = f"at most {MOST_LARGER} times its sides, and {MOST_NUMBERS:,}, are read"
             fail(f"{declares} {photograph[0]} x {photograph[1]} pixels: {limits}. {_WITHOUT}")
 
     with parsing(path, _WITHOUT):
@@ -166,7 +165,7 @@ def _read_exr(path: Path, check: Check) -> npt.NDArray[Any]:
 
 
 def _check_exr_header(file: IO[bytes]) -> None:
-    """Raise ValueError if the header lacks an attribute that every EXR file has: OpenEXR crashes on such files."""
+    """Raise ValueError if the header lacks a required attribute: OpenEXR crashes on such files."""
     data, start, names = file.read(EXR_HEADER), 8, set()
     file.seek(0)
     while data[start : start + 1] not in (b"", b"\0"):
@@ -179,7 +178,7 @@ def _check_exr_header(file: IO[bytes]) -> None:
 
 
 def read_array(path: Path, check: Check) -> npt.NDArray[Any]:
-    """Read a .npy file, or the first array of a .npz file, if `check` passes. Raises OSError, ValueError."""
+    """Read a .npy file, or the first array of a .npz file. Raises OSError, ValueError, or what `check` does."""
     with open_regular(path) as file:
         if path.suffix.lower() != ".npz":
             return _array(file, check)
@@ -205,7 +204,7 @@ def _array(file: IO[bytes], check: Check) -> npt.NDArray[Any]:
 
 
 def image_shape(path: Path) -> tuple[int, int]:
-    """Read height and width of an image for OpenCV from its header. Raises OSError, ValueError: it is none."""
+    """Read height and width of an image from its header. Raises OSError, ValueError: it is none."""
     with open_regular(path) as file:
         start = file.read(16)
         if start.startswith(TIFFS):

@@ -1,4 +1,4 @@
-"""Read EXIF of photographs: camera, focal length, exposure, GPS position, time and gravity, if plausible."""
+"""Read EXIF of photographs, and check what it states."""
 
 import math
 import struct
@@ -10,27 +10,25 @@ from typing import Any
 from PIL import ExifTags, Image
 
 FULL_FRAME_DIAGONAL = math.hypot(36.0, 24.0)  # millimetres, of focal lengths "in 35 mm film"
-SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)  # aspect ratios of uncropped photographs
-SAME_ASPECT = 0.02  # relative difference of aspect ratios by rounding to blocks of pixels
+SENSOR_ASPECTS = (4 / 3, 3 / 2, 16 / 9, 5 / 4)  # of uncropped photographs
+SAME_ASPECT = 0.02  # relative difference by rounding
 FOCAL_RANGE = (0.3, 15.0)  # plausible focal lengths in longer sides
-STILL = 0.1  # tolerance of the acceleration of a phone held still, g
+STILL = 0.1  # tolerance of the acceleration when held still, g
 
 
 @dataclass(frozen=True)
 class Exif:
-    """EXIF of one photograph."""
-
-    camera: str = ""  # Make, model, lens and focal length; photographs of equal ones and equal size share a camera.
+    camera: str = ""  # make, model, lens and focal length
     focal_length: float | None = None  # pixels; None = none plausible
     doubt: str = ""  # why a stated focal length is not used
     position: tuple[float, float, float] | None = None  # latitude and longitude in degrees, altitude in metres
     time: str = ""  # sortable; empty = unknown
     up: tuple[float, float, float] | None = None
-    """Unit vector away from the ground, in axes of the upright photograph (x right, y down, z forward)."""
+    """Unit vector away from the ground, in OpenCV axes of the upright photograph."""
 
 
 def read_exif(image: Image.Image) -> Exif:
-    """Read the EXIF of an opened image before it is turned upright; broken entries count as missing."""
+    """Read the EXIF of an image not yet turned upright; broken entries count as missing."""
     try:
         tags = image.getexif()
         detail = tags.get_ifd(ExifTags.IFD.Exif)
@@ -48,7 +46,7 @@ def read_exif(image: Image.Image) -> Exif:
 
 
 def focal_length(detail: Mapping[int, Any], size: tuple[int, int]) -> tuple[float | None, str]:
-    """Compute the focal length in pixels from the Exif IFD and the stored size, and why a stated one is not used."""
+    """Compute the focal length in pixels from the Exif IFD and the stored size, or why a stated one is not used."""
     long, short = max(size), min(size)
     film = number(detail.get(ExifTags.Base.FocalLengthIn35mmFilm))
     millimetres = number(detail.get(ExifTags.Base.FocalLength))
@@ -70,23 +68,22 @@ def focal_length(detail: Mapping[int, Any], size: tuple[int, int]) -> tuple[floa
     else:
         pixels = (millimetres or 0.0) * (density or 0.0) / unit * long / max(stated)
     if not FOCAL_RANGE[0] * long <= pixels <= FOCAL_RANGE[1] * long:
-        return None, f"{pixels:.0f} pixels cannot be meant for an image {long} pixels long"
+        return None, f"{pixels:.0f} pixels, for an image {long} pixels long"
     return pixels, ""
 
 
 def number(value: Any) -> float | None:
-    """Convert to a positive finite number, or None: files hold text and rationals with a denominator of 0."""
+    """Convert to a positive finite number, else None."""
     with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
         return float(value) if 0 < float(value) < math.inf else None
     return None
 
 
 EXPOSURE = (ExifTags.Base.ExposureTime, ExifTags.Base.FNumber, ExifTags.Base.ISOSpeedRatings)
-"""Tags of shutter time, f-number and ISO."""
 
 
 def exposure_exif(image: Image.Image) -> Image.Exif:
-    """Copy the exposure tags of an opened image to new EXIF, without orientation and position."""
+    """Copy the exposure tags of an image to new EXIF, without orientation and position."""
     kept = Image.Exif()
     try:
         detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
@@ -98,7 +95,7 @@ def exposure_exif(image: Image.Image) -> Image.Exif:
 
 
 def exposure_settings(image: Image.Image) -> tuple[float | None, ...]:
-    """Read shutter time (seconds), f-number and ISO; () without a time. Raises many errors on broken EXIF."""
+    """Read shutter time (seconds), f-number and ISO; () without a time. Raises any error on broken EXIF."""
     detail = image.getexif().get_ifd(ExifTags.IFD.Exif)
     values = []
     for tag in EXPOSURE:
@@ -110,12 +107,12 @@ def exposure_settings(image: Image.Image) -> tuple[float | None, ...]:
 
 
 def exif_stops(seconds: float, f_number: float, iso: float) -> float:
-    """Compute log2 of the exposure: shutter time times ISO over the square of the f-number."""
+    """Compute log2 of the exposure."""
     return math.log2(seconds * iso / (f_number * f_number))
 
 
 def _up(image: Image.Image, tags: Mapping[int, Any], detail: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    """Find up from a phone's accelerometer; None = none stated, the phone moved, or the picture is turned otherwise."""
+    """Find `Exif.up` by an iPhone's accelerometer; None = none, or it disagrees with the picture's top."""
     note = detail.get(ExifTags.Base.MakerNote)
     if not isinstance(note, bytes) or "front" in str(detail.get(ExifTags.Base.LensModel)).lower():
         return None
@@ -125,19 +122,19 @@ def _up(image: Image.Image, tags: Mapping[int, Any], detail: Mapping[int, Any]) 
     left, bottom, into = (value / math.hypot(*down) for value in down)
     # the sensor's rows run from top to bottom of the phone, its columns from right to left
     turns = {1: (bottom, left), 3: (-bottom, -left), 6: (-left, bottom), 8: (left, -bottom)}
-    # Pillow turns HEIC on opening, and keeps its orientation here
+    # Pillow has turned HEIC
     orientation = image.info.get("original_orientation") or tags.get(ExifTags.Base.Orientation, 1)
     if orientation not in turns:
         return None
     x, y = turns[orientation]
-    upright = y < 0 and abs(x) <= -y  # nearest to the picture's top
+    upright = y < 0 and abs(x) <= -y
     return (x, y, into) if upright or math.hypot(x, y) < 0.5 else None
 
 
 def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
-    """Parse AccelerationVector (tag 8) of Apple's maker note, in g. Its axes point to the phone's left side as seen
-    from its front, to its bottom, and into its face. For a phone held still it points away from the ground. The note
-    has 14 bytes, "Apple iOS", its version and "MM", then an IFD of big-endian numbers; offsets count from its start."""
+    """Parse AccelerationVector (tag 8) of Apple's maker note, in g: axes towards the phone's left side as seen from its
+    front, its bottom, and into its face; away from the ground if held still. The note has 14 bytes, "Apple iOS",
+    version and "MM", then a big-endian IFD; offsets count from its start."""
     if not note.startswith(b"Apple iOS\0") or note[12:14] != b"MM":
         return None
     with suppress(struct.error, ZeroDivisionError):
@@ -152,7 +149,6 @@ def apple_acceleration(note: bytes) -> tuple[float, float, float] | None:
 
 
 def _position(gps: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    """Read latitude, longitude and altitude; None unless the first two are plausible."""
     with suppress(KeyError, TypeError, ValueError, ZeroDivisionError):
         angles = []
         for tag, reference in ((2, 1), (4, 3)):

@@ -1,4 +1,4 @@
-"""Find a capture's files by the names in its metadata, even names of another machine."""
+"""Find a capture's files by names that may be of another machine."""
 
 import difflib
 import os
@@ -17,45 +17,44 @@ from .kinds import PHOTOGRAPHS
 from .recognise import Found, models_in
 from .types import MAP_FILES, MapFiles, Photograph, fail, say, warn
 
-Parts = tuple[str, ...]  # folders and file of a name, in one case and one Unicode form
+Parts = tuple[str, ...]  # folders and file of a name
 _DRIVE = re.compile(r"^[A-Za-z]:")
 
 
 def folded(name: str) -> Parts:
-    """Remove what differs between machines from a name: separators, case, Unicode form, `.` and a drive."""
+    """Remove what differs between machines: separators, case, Unicode form, `.` and a drive."""
     portable = _DRIVE.sub("", name).replace("\\", "/")
     plain = unicodedata.normalize("NFC", os.path.normpath(portable)).casefold()
     return tuple(part for part in plain.split("/") if part not in ("", "."))
 
 
 def without_extension(parts: Parts) -> Parts:
-    """Remove an image's extension from a folded name."""
     stem, ending = os.path.splitext(parts[-1])
     return (*parts[:-1], stem if ending in PHOTOGRAPHS else parts[-1])
 
 
 @dataclass
 class FileFinder:
-    """Finder of files below a folder by names that machines and programs may have changed: the exact one first, then
-    the only one with other separators, case, Unicode form or leading folders, then with another extension or none."""
+    """Finder of files below a folder: by the exact name, else by the only one with other separators, case, Unicode form
+    or leading folders, else with another extension or none."""
 
     folder: Path  # to which names are relative
     outside: bool = False  # allow names that lead out of it
-    extensions: tuple[str, ...] = PHOTOGRAPHS  # of the files, in lower case
+    extensions: tuple[str, ...] = PHOTOGRAPHS  # of the files
 
     def find(self, name: str) -> Path | None:
-        """Find a file; None = none, or more than one."""
+        """Find a file; None = none, or several."""
         for exact in (name, name.replace("\\", "/")):
             if (self.outside or leads_inside(exact)) and os.path.isfile(self.folder / exact):
                 return self.folder / exact
         parts = folded(name)
         if not parts:
             return None
-        stems = (parts, without_extension(parts))  # for names without extension, and with another one
-        return self._match(parts, self._whole) or next(filter(None, (self._match(p, self._stems) for p in stems)), None)
+        tries = (parts, self._whole), (parts, self._stems), (without_extension(parts), self._stems)
+        return next(filter(None, (self._match(*each) for each in tries)), None)
 
     def find_all(self, names: Sequence[str]) -> list[Path | None]:
-        """Find the files of several names. A file that fits several is that of its exact name, or of none."""
+        """Find several files; one that fits several names is that of its exact name, or of none."""
         files = [self.find(name) for name in names]
         exact = [path if self.folder / name == path else None for name, path in zip(names, files, strict=True)]
         users, sure = Counter(files), Counter(exact)
@@ -70,12 +69,12 @@ class FileFinder:
         return self.folder.joinpath(*("_" if part in ("/", "//", "..") else part for part in parts))
 
     def ambiguous(self, name: str) -> list[str]:
-        """List the files that a name may mean apart from its extension, if there are several."""
+        """List the files that a name may mean apart from its extension, if several."""
         files = self._stems.get(without_extension(folded(name)), [])
         return [path.relative_to(self.folder).as_posix() for path in files] if len(files) > 1 else []
 
     def nearest(self, name: str, taken: Iterable[str] = ()) -> str:
-        """Describe a file of a similar name that is not of the names `taken`, as "but there is ..."; empty = none."""
+        """Describe a file of a similar name that is not `taken`, as "but there is ..."; empty = none."""
         wanted, used = folded(name)[-1:], {folded(path)[-1:] for path in taken}
         last = {parts[-1]: files[0] for parts, files in self._whole.items() if parts[-1:] not in used}
         near = difflib.get_close_matches(wanted[0] if wanted else "", last, n=1, cutoff=0.8)
@@ -86,7 +85,7 @@ class FileFinder:
         return f"but there is {there}" if same else f"but there is {there}, {ascii(there)}, instead of {ascii(name)}"
 
     def _match(self, parts: Parts, table: dict[Parts, list[Path]]) -> Path | None:
-        for start in range(len(parts)):  # the whole name first, then without its leading folders
+        for start in range(len(parts)):  # without its leading folders
             files = table.get(parts[start:], [])
             if files:
                 return files[0] if len(files) == 1 else None
@@ -111,30 +110,19 @@ class FileFinder:
         return dict(table)
 
 
-# os.path.isfile, unlike Path.is_file, is False for paths too long for the file system, instead of raising.
 def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
-    """Fail if photographs of a capture's file or folder are missing, with similar names of existing files."""
+    """Fail if photographs that `source` names are missing; show similar names."""
     names = list(dict.fromkeys(files))
-    missing = [file for file in names if not os.path.isfile(file)]
+    missing = [file for file in names if not os.path.isfile(file)]  # Path.is_file raises if a path is too long
     if not missing:
         return
     shown = "\n  ".join(f"{file}{_hint(source.parent, file, names)}" for file in missing[:3])
-    advice = f"Copy them there, correct the names or remove the frames.{smaller_copies(missing)}"
+    advice = "Copy them there, correct the names or remove the frames."
     fail(f"{len(missing)} of {len(names)} photographs of {source} are missing:\n  {shown}\n{advice}")
 
 
-def smaller_copies(files: Iterable[Path]) -> str:
-    """Say how to use copies of missing photographs that are there in a folder such as `images_2`; empty = none."""
-    for file in files:
-        for factor in (2, 4, 8, 16):
-            folder = file.parent.with_name(f"{file.parent.name}_{factor}")
-            if os.path.isfile(folder / file.name):
-                return f" Or use their copies in {folder}: `bitymi-data --downscale-factor {factor}`."
-    return ""
-
-
 def name_unused(found: Found, used: Iterable[Path | None], masks: Iterable[Path | None], downscale: int | None) -> None:
-    """Report pictures that are neither `used` nor `masks`, except copies smaller by `downscale`, such as `images_2`."""
+    """Report pictures that are neither `used` nor `masks` nor copies smaller by `downscale`."""
     named, masked = ({Path(os.path.normpath(path)) for path in paths if path is not None} for paths in (used, masks))
     folder, copies = Path(os.path.normpath(found.folder)), None if downscale is None else f"_{downscale}"
     models = {images: model for model in models_in(folder) for images in images_of(folder / model)}
@@ -148,12 +136,12 @@ def _hint(folder: Path, file: Path, named: Sequence[Path]) -> str:
     if os.path.exists(file):
         return " (not a file)"
     finder = FileFinder(file.parent if os.path.isdir(file.parent) else folder)
-    near = finder.nearest(file.name, [each.name for each in named])
+    near = finder.nearest(file.name, [path.name for path in named])
     return f" ({near})" if near else ""
 
 
 def report_renamed(source: str, names: Sequence[str], files: Sequence[Path], folder: Path) -> None:
-    """Report files found under other names. A missing extension or other separators do not count."""
+    """Report files with other names than stated, apart from a missing extension and separators."""
 
     def is_usual(name: str, file: Path) -> bool:
         plain = Path(os.path.normpath(folder / name.replace("\\", "/")))
@@ -166,7 +154,7 @@ def report_renamed(source: str, names: Sequence[str], files: Sequence[Path], fol
 
 
 def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:
-    """Report files with other names than stated, and warn of those outside the folder, as results will show them."""
+    """Report files with other names than stated, and warn of those outside the folder, which results will show."""
     report_renamed(str(path), names, files, path.parent)
     folder = os.path.normpath(path.parent)
     pictures = dict.fromkeys(Path(os.path.normpath(file)) for file in (*files, *masks) if file is not None)
@@ -176,7 +164,7 @@ def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks:
 
 
 def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:
-    """Find the photographs that a file names; missing ones keep their names. Fail if a name fits several files."""
+    """Find the photographs that a file names; missing ones have the stated path. Fail if a name fits several files."""
     folder = path.parent
     finder = FileFinder(folder, outside=True)
     files = finder.find_all(names)
@@ -194,7 +182,7 @@ def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> lis
 def find_masks(
     folder: Path, names: Sequence[str | None], photographs: Sequence[Path], need_photos: bool
 ) -> list[Path | None]:
-    """Find masks, which photographs may share, by name; missing ones keep their stated names."""
+    """Find masks, which photographs may share; missing ones have the stated path."""
     finder = FileFinder(folder, outside=True)
     taken = {None, *photographs}
     files = {name: finder.find(name) if need_photos else None for name in dict.fromkeys(names) if name is not None}
@@ -202,7 +190,7 @@ def find_masks(
 
 
 def find_maps(path: Path, frames: Sequence[dict[str, Any]], need_photos: bool) -> list[MapFiles]:
-    """Find maps of depth and normals; warn of missing ones."""
+    """Find depth and normals; warn of missing files."""
     finder = FileFinder(path.parent, outside=True, extensions=MAP_FILES)
     files: dict[str, list[Path | None]] = {}
     for key in ("depth_file_path", "normal_file_path"):
@@ -221,7 +209,7 @@ def find_named(names: Sequence[Path], wanted: Sequence[str], source: str, any_fo
         folded,
         lambda name: without_extension(folded(name) or ("",)),
     ]
-    tables: list[dict[Parts, list[int]]] = [defaultdict(list) for _ in forms]  # photographs by ends of their names
+    tables: list[dict[Parts, list[int]]] = [defaultdict(list) for _ in forms]  # by ends of names
     for form, table in zip(forms, tables, strict=True):
         for i, parts in enumerate(form(str(name)) for name in names):
             for start in range(len(parts)):
@@ -243,7 +231,7 @@ def find_named(names: Sequence[Path], wanted: Sequence[str], source: str, any_fo
 
 
 def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> list[Photograph]:
-    """Replace photographs by copies in `images_2` beside `images`, if there are any; these may lack subfolders."""
+    """Replace photographs by copies in `images_2` beside `images`, if any; these may lack subfolders."""
 
     def copies(file: Path) -> list[Path]:
         inside = file.relative_to(folder).parts if file.is_relative_to(folder) else (file.parent.name, file.name)
@@ -256,15 +244,15 @@ def downscaled(photographs: list[Photograph], folder: Path, downscale: int) -> l
         copy = None if mask is None else folder / f"masks_{downscale}" / mask.name
         return copy if copy is not None and os.path.isfile(copy) else mask
 
-    files = [each.file for each in photographs]
-    small = [next(filter(os.path.isfile, copies(file)), copies(file)[0]) for file in files]  # some may be missing
+    files = [photograph.file for photograph in photographs]
+    small = [next(filter(os.path.isfile, copies(file)), copies(file)[0]) for file in files]
     if not any(map(os.path.isfile, small)):
         return photographs
     if len(set(small)) < len(set(files)):
         uses = Counter(small)
         twins = sorted({file.relative_to(folder).as_posix() for file, copy in zip(files, small, strict=True)
                         if uses[copy] > 1})  # fmt: skip
-        where = f"have the same names in different folders, but {small[0].parent} can have one of each alone"
+        where = f"have the same names in different folders, of which {small[0].parent} can hold one"
         fail(f"{listed(twins)} {where}. Use `bitymi-data --downscale-factor 1`, or give them different names.")
-    return [replace(each, file=copy, mask=mask_copy(each.mask), downscaled=True)
-            for each, copy in zip(photographs, small, strict=True)]  # fmt: skip
+    return [replace(photograph, file=copy, mask=mask_copy(photograph.mask), downscaled=True)
+            for photograph, copy in zip(photographs, small, strict=True)]  # fmt: skip

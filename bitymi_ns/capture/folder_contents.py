@@ -1,4 +1,4 @@
-"""Tell photographs from other pictures of a folder by the table of `kinds.py`, and name what is not read."""
+"""Tell photographs from other pictures by the table of `kinds.py`, and name what is not read."""
 
 import fnmatch
 import os
@@ -18,27 +18,26 @@ from bitymi_ns.trust import listed
 from . import kinds
 from .kinds import Kind
 
-pillow_heif.register_heif_opener()  # for all users of Pillow
+pillow_heif.register_heif_opener()
 
 FORMATS_OF_PICTURES = (
     "JPEG", "MPO", "PNG", "WEBP", "TIFF", "BMP", "HEIF", "AVIF", "JPEG2000", "GIF", "PPM", "TGA"
 )  # fmt: skip
-"""Formats of photographs and masks by Pillow's names, whatever the file name; not EPS, a program that Ghostscript
-runs."""
-HEAD = 1 << 20  # bytes of a file that are searched for a mark
-COMMENT = 1 << 10  # bytes at the start of a picture that are searched for its comment
+"""Pillow's formats of photographs and masks; not EPS, a program that Ghostscript runs."""
+HEAD = 1 << 20  # bytes searched for a mark
+COMMENT = 1 << 10  # bytes searched for a picture's comment
 HIDDEN, OTHER, EVALUATED = map(Kind, ("", "", ""), ("hidden", "pictures of another capture", "renders of ns-eval"))
 
 
 def open_picture(file: Path) -> Image.Image:
-    """Open a photograph or mask with Pillow; raises errors of Pillow's and of `open_regular`."""
+    """Open a photograph or mask. Raises errors of Pillow and of `open_regular`."""
     open_regular(file).close()
-    Image.init()  # loads all formats; earlier versions of Pillow have no AVIF
+    Image.init()  # earlier versions of Pillow have no AVIF
     return Image.open(file, formats=[name for name in FORMATS_OF_PICTURES if name in Image.OPEN])
 
 
 def holds(path: Path, mark: bytes, most: int = HEAD) -> bool:
-    """Test if the first bytes of a file hold `mark`; False for unreadable files."""
+    """Test if a file's first bytes hold `mark`; False for unreadable files."""
     with suppress(OSError), open_regular(path) as file:
         return mark in file.read(min(most, os.fstat(file.fileno()).st_size))
     return False
@@ -51,7 +50,7 @@ def _pattern(names: str) -> re.Pattern[str]:
 
 
 def kind_of(path: Path, rows: Iterable[Kind], beside: Collection[str] = ()) -> Kind | None:
-    """Find the row of a file or folder by its name, the lower-case names `beside` it and content; None = unknown."""
+    """Find the row of a file or folder by its name, the lower-case names `beside` it, and its content."""
     for row in rows:
         for form in (path.name.lower(), path.stem.lower()):
             if match := _pattern(row.names).match(form):
@@ -64,12 +63,11 @@ def kind_of(path: Path, rows: Iterable[Kind], beside: Collection[str] = ()) -> K
 
 
 def is_picture(path: Path) -> bool:
-    """Test for a file with a photograph's extension that is not hidden."""
     return path.suffix.lower() in kinds.PHOTOGRAPHS and not path.name.startswith(".") and path.is_file()
 
 
 def look_in(folder: Path, among: Collection[Path] | None = None) -> Iterator[tuple[Path, Kind | None]]:
-    """Walk a folder, or `among` its folders: yield photographs with None, what is not searched or read with kinds."""
+    """Walk a folder, or `among` its folders; yield photographs with None, and what is not searched or read."""
     for parent, below, names in os.walk(folder):
         where, left = Path(parent), _left_out(Path(parent), below)
         yield from ((where / name, kind) for name, kind in left.items() if kind is not HIDDEN)
@@ -78,7 +76,7 @@ def look_in(folder: Path, among: Collection[Path] | None = None) -> Iterator[tup
 
 
 def _files(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, Kind | None]]:
-    """Yield pictures, unread films and images of a folder with their kinds, but no raw data beside its photograph."""
+    """Yield the pictures and unread films of a folder, but no raw data beside its photograph."""
     paths = [folder / name for name in sorted(names) if not name.startswith(".")]
     pictures = [path for path in paths if is_picture(path)]
     stems = {path.stem.lower() for path in pictures}
@@ -94,7 +92,7 @@ def _files(folder: Path, names: Iterable[str]) -> Iterator[tuple[Path, Kind | No
 
 
 def _left_out(parent: Path, below: Collection[str]) -> dict[str, Kind]:
-    """Map subfolders that are not searched to their kinds; captures beside photographs hold copies of these."""
+    """Map subfolders that are not searched to kinds; captures beside photographs hold copies of these."""
     names, left, captures = {name.lower() for name in below}, {}, []
     for path in sorted(parent / name for name in below):
         kind = HIDDEN if path.name.startswith(".") else kind_of(path, kinds.FOLDERS, names) or result_in(path)
@@ -108,7 +106,7 @@ def _left_out(parent: Path, below: Collection[str]) -> dict[str, Kind]:
 
 
 def photographs_in(folder: Path) -> list[Path]:
-    """List the photographs of a folder by name; empty if it cannot be read."""
+    """List the photographs of a folder; none if there is no such folder."""
     names = os.listdir(folder) if folder.is_dir() else ()
     return [path for path, kind in _files(folder, names) if kind is None]
 
@@ -120,7 +118,6 @@ def photo_folder(source: Path) -> Path:
 
 
 def photographs_below(folder: Path) -> Iterator[Path]:
-    """Yield the photographs in and below a folder, without hidden folders and those of other content."""
     return (path for path, kind in look_in(folder) if kind is None)
 
 
@@ -131,7 +128,7 @@ def folders_in(folder: Path) -> list[Path]:
 
 
 def unreadable_in(folder: Path) -> str:
-    """Say which folders in and below a folder cannot be listed, and why, as a sentence; empty = none."""
+    """Say which folders in and below a folder cannot be listed, and why; empty = none."""
     errors: list[OSError] = []
     for _ in os.walk(folder, onerror=errors.append):
         pass
@@ -140,13 +137,12 @@ def unreadable_in(folder: Path) -> str:
 
 
 def videos_in(folder: Path, rendered: bool = False) -> list[Path]:
-    """List a folder's videos that are not hidden; `rendered`: films of ns-render instead."""
+    """List a folder's videos that are not hidden, or those of ns-render (`rendered`)."""
     names = (path for path in folder.iterdir() if path.suffix.lower() in kinds.VIDEOS and not path.name.startswith("."))
     return sorted(path for path in names if path.is_file() and is_rendered_film(path) is rendered)
 
 
 def is_rendered_film(path: Path) -> bool:
-    """Test for a film that ns-render wrote."""
     return path.suffix.lower() in kinds.VIDEOS and holds(path, kinds.RENDERED)
 
 
@@ -157,10 +153,9 @@ def passed_over(
     masks: Collection[Path] = (),
     models: Mapping[Path, Path] | None = None,
 ) -> list[str]:
-    """Describe the pictures in and below a folder that are not read: those that `photographs_below` leaves out, but
-    `masks` and others beside them; given the `used` files, also other photographs in their folders and one level below,
-    with the `models` that have these. Folders whose names end in `copies` (as `images_2`) are left out."""
-    # a folder of captures may hold a whole disk
+    """Describe the pictures in and below a folder that are not read, without `masks` and what lies beside them. Given
+    the `used` files, also describe other photographs in their folders and one level below, and of which of the `models`
+    they are. Folders whose names end in `copies` (as `images_2`) do not count."""
     among = None if used is None else {above for path in used for above in path.parents}
     groups: dict[tuple[Kind | None, Path, str], list[Path]] = defaultdict(list)
     described, known, masked = [], {*(used or ()), *masks}, {above for mask in masks for above in mask.parents}
@@ -168,7 +163,7 @@ def passed_over(
         if kind in kinds.OF_MASKS and (path if path.is_dir() else path.parent) in masked:
             continue
         if kind is not None and path.is_dir():
-            count = sum(is_picture(each) and each not in known for each in path.rglob("*"))
+            count = sum(is_picture(file) and file not in known for file in path.rglob("*"))
             if count and not (copies and path.name.endswith(copies)):
                 described.append(f"{path.relative_to(folder)} ({kind.what}: {count}{_use(kind)})")
         elif path not in known and (used is not None or kind is not None):
@@ -191,10 +186,10 @@ def _use(kind: Kind) -> str:
 
 
 def result_in(folder: Path) -> Kind | None:
-    """Find the result that a folder's pictures are of, by what lies in it; None = none."""
+    """Find the result that a folder's pictures are of."""
     try:
         names = sorted(os.listdir(folder))
-    except OSError:  # unreadable folders are allowed
+    except OSError:
         return None
     rows = [row for row in kinds.RESULTS if row is not kinds.RENDERS or folder.name in kinds.SPLITS]
     if row := next(filter(None, (kind_of(folder / name, rows) for name in names)), None):
@@ -207,15 +202,15 @@ def result_in(folder: Path) -> Kind | None:
 
 
 def images_of(model: Path) -> list[Path]:
-    """List the folders of pictures that belong to a COLMAP model by the table, the likeliest first."""
+    """List the folders of a COLMAP model's pictures, the likeliest first."""
     path = os.path.abspath(model)
     matches = ((_pattern(row.names).match(path), row.what) for row in kinds.IMAGES_OF)
     folders = [what.replace("NAME", next(filter(None, match.groups()))) for match, what in matches if match]
-    return [Path(os.path.normpath(model / os.path.relpath(each, path))) for each in folders]  # relative if `model` is
+    return [Path(os.path.normpath(model / os.path.relpath(folder, path))) for folder in folders]  # relative if it is
 
 
 def refusal(folder: Path) -> str:
-    """Say why a folder cannot be trained on, and what to do, if it is a bundle or a run; empty = it can."""
+    """Say what to do with a bundle or a run; empty = it is neither."""
     what, give = result_in(folder) if folder.is_dir() else None, "give the folder of its photographs"
     if what is kinds.BUNDLE:
         return f"{folder} is a bundle, not a capture: {give}. `bitymi view {folder}` shows the bundle."
@@ -225,7 +220,7 @@ def refusal(folder: Path) -> str:
 
 
 def poses_in(folder: Path) -> tuple[str, ...]:
-    """Describe the files of poses in a folder and its subfolders, with what converts them."""
+    """Describe the files of poses in a folder and its subfolders, and what converts them."""
     files: dict[Kind, list[Path]] = defaultdict(list)
     for where in (folder, *sorted(path for path in folder.iterdir() if path.is_dir() and path.name[0] != ".")):
         for path in sorted(where.iterdir()) if os.access(where, os.R_OK) and not result_in(where) else ():

@@ -1,4 +1,4 @@
-"""World frame of a model: z up by gravity, GPS or the cameras; metric scale by GPS."""
+"""World frame of a model: z up by gravity, GPS or the cameras; metres by GPS."""
 
 import json
 from collections.abc import Mapping
@@ -17,23 +17,21 @@ from . import pycolmap
 from .types import warn
 
 GPS_ERROR = 5.0  # of phones, metres
-LEAST_SPREAD = 4 * GPS_ERROR  # least spread of positions that determines the scale, metres
-AGREEMENTS = (1.0, 2.5, GPS_ERROR, 2 * GPS_ERROR)  # distances in metres within which positions may agree
+LEAST_SPREAD = 4 * GPS_ERROR  # of positions that determine the scale, metres
+AGREEMENTS = (1.0, 2.5, GPS_ERROR, 2 * GPS_ERROR)  # metres within which positions may agree
 SAME_SHAPE = 0.5  # largest error of an alignment, relative to the spread
 FILE = "frame.json"  # beside the report
 UP = (0.0, 0.0, 1.0)  # up in the world frame
-SAME_UP = np.cos(np.radians(10.0))  # cosine of the largest angle between equal up directions
-STEEPEST = np.cos(np.radians(45.0))  # cosine of the largest tilt of GPS positions against gravity; else ignore gravity
+SAME_UP = np.cos(np.radians(10.0))  # cosine of the largest angle between equal ups
+STEEPEST = np.cos(np.radians(45.0))  # cosine of the largest angle between GPS's up and gravity that counts
 
 
 @dataclass(frozen=True)
 class WorldFrame:
-    """Relation of a model's world to the real one."""
-
     up: Literal["gps", "gravity", "cameras"]  # source of up (+z)
-    metres_per_unit: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None  # 1 with scale by GPS; None = unknown
+    metres_per_unit: Annotated[float, Field(gt=0, allow_inf_nan=False)] | None  # 1 by GPS; None = unknown
     gps_origin: tuple[float, float, float] | None
-    """Latitude, longitude (degrees) and altitude (metres) of the origin, x east and y north there."""
+    """Latitude, longitude (degrees) and altitude (metres) of the origin, with x east and y north."""
     gps_error: float | None  # median distance of cameras from GPS positions that agree, metres
     gps_positions: int  # photographs with a position
     transform: list[list[float]]  # [3, 4] from COLMAP's world, with scale
@@ -45,14 +43,14 @@ def write_frame(folder: Path, frame: WorldFrame) -> None:
 
 
 def read_frame(folder: Path) -> WorldFrame | None:
-    """Read frame.json in a folder; None = none, or another program's."""
+    """Read frame.json; None = none, or another program's."""
     with suppress(OSError, ValueError):
         return TypeAdapter(WorldFrame).validate_python(read_json(folder / FILE))
     return None
 
 
 def gps_line(folder: Path) -> str:
-    """Describe what the world of a model has from GPS, by frame.json in a folder; empty = nothing."""
+    """Describe GPS's part in frame.json of a folder; empty = none."""
     frame = read_frame(folder)
     if frame is None or frame.gps_error is None:
         return ""
@@ -63,7 +61,8 @@ def gps_line(folder: Path) -> str:
 def local_positions(
     gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
-    """Convert GPS positions (degrees, metres) to east, north and up in metres at their middle; return that, too."""
+    """Convert GPS positions (degrees, metres) to east, north and up in metres at their middle, which is returned,
+    too."""
     if not gps:
         return {}, None
     values = np.array(list(gps.values()))
@@ -80,8 +79,8 @@ def move_to_world(
     gps: Mapping[str, tuple[float, float, float]],
     ups: Mapping[str, tuple[float, float, float]] | None = None,
 ) -> WorldFrame:
-    """Transform a model in place to a world with z up: that of the accelerometers if most agree and GPS's up, if known,
-    is within 45 degrees of it; else GPS's if its positions determine it, else the cameras' mean. Scale and north are
+    """Transform a model in place to a world with z up: by accelerometers, if most agree to 10 degrees and with GPS's up
+    (if known) to 45; else by GPS, if its positions determine it; else by the cameras' mean up. Scale and north are
     GPS's if it determines them. `gps`: degrees and metres; `ups`: unit vectors in the cameras' axes (OpenCV)."""
     up = _by_gravity(model, ups or {})
     local, origin = local_positions(gps)
@@ -92,7 +91,7 @@ def move_to_world(
         similarity, agree = by_gps
         source, by_phones = "gps", None if up is None else similarity.rotation.matrix() @ up
         if by_phones is not None and by_phones @ UP > STEEPEST:
-            turn, _ = Rotation.align_vectors(UP, by_phones)  # the smallest one
+            turn, _ = Rotation.align_vectors(UP, by_phones)
             turn = pycolmap.Rotation3d(turn.as_matrix())
             source, similarity = "gravity", pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
         model.transform(similarity)
@@ -105,17 +104,17 @@ def move_to_world(
 
 
 def _gps_errors(similarity: pycolmap.Sim3d, centers: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Measure the distances [n] in metres between cameras [n, 3] after a similarity and their GPS positions [n, 3]."""
+    """Measure distances [n] in metres between transformed cameras and their GPS positions [n, 3]."""
     return np.linalg.norm((similarity * centers) - positions, axis=1)
 
 
 def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, float, float]]) -> np.ndarray | None:
-    """Average the accelerometers' up [3] in the model's world; None unless three or more, and most of them, agree."""
+    """Average the accelerometers' up [3] in the model's world; None unless three, and most of them, agree."""
     images = [image for image in model.images.values() if image.has_pose and image.name in ups]
     if len(images) < 3:
         return None
     directions = np.array([image.cam_from_world().rotation.matrix().T @ ups[image.name] for image in images])
-    agreeing = directions @ directions.T > SAME_UP  # [n, n]
+    agreeing = directions @ directions.T > SAME_UP
     most = agreeing[np.argmax(agreeing.sum(axis=1))]
     if most.sum() < 3 or most.mean() <= 0.5:
         return None
@@ -124,8 +123,8 @@ def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, f
 
 
 def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d, np.ndarray] | None:
-    """Align centers [n, 3] with the largest group [n] of positions [n, 3] in metres that agree; None if these are too
-    few, too close together, on one line, or of another shape."""
+    """Align centers [n, 3] with positions [n, 3] in metres, and mark those that agree [n]; None if these are too few,
+    too close together, on one line, or of another shape."""
     if len(positions) < 3:
         return None
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))
@@ -133,7 +132,7 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
     if spread[0] < LEAST_SPREAD or spread[1] < LEAST_SPREAD / 2 or shape[1] < 0.05 * shape[0]:
         return None
     options = pycolmap.RANSACOptions(random_seed=0)
-    for error in AGREEMENTS:  # the least within which half agree: others may be of another flight
+    for error in AGREEMENTS:  # the least to which half agree: others may be of another flight
         options.max_error = error
         result = pycolmap.estimate_sim3d_robust(centers, positions, options)
         if result is None:
@@ -152,7 +151,7 @@ def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d,
 
 
 def _by_up(model: pycolmap.Reconstruction, centers: np.ndarray, up: np.ndarray | None) -> pycolmap.Sim3d:
-    """Make the similarity that turns `up`, None = the cameras' mean, to z, and centers and scales the cameras."""
+    """Make the similarity that turns `up` (None = the cameras' mean) to z, and centers and scales the cameras."""
     turns = np.array([image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose])
     side, down, _ = turns.mean(0)
     axis = up

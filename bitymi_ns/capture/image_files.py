@@ -1,4 +1,4 @@
-"""Image files of a capture: bit depth, sizes and EXIF from headers, blank and duplicate photographs."""
+"""Image files: headers, bit depth, color profiles, blank and duplicate photographs."""
 
 import hashlib
 import math
@@ -20,46 +20,43 @@ from .types import Photograph, fail, parsing
 
 S = TypeVar("S")
 T = TypeVar("T")
-MAX_PIXELS = 1_000_000_000  # photographs with more pixels are refused; phones take some of 200 million
+MAX_PIXELS = 1_000_000_000  # of a photograph; phones take some of 200 million
 THREADS = 4
 PROPORTIONS = 0.02  # relative difference of aspect ratios by rounding
 FINGERPRINT_SIZE = 64  # pixels across and down that fingerprints compare
-WHITES = ((255.0, 65535.0), (1.0, 255.0))  # usual ones of integers, and of floating-point numbers
+WHITES = ((255.0, 65535.0), (1.0, 255.0))  # usual ones of integers, and of floats
 EMPTY: dict[str, Callable[[npt.NDArray[np.uint8]], bool]] = {
     "transparent everywhere": lambda image: image.shape[-1] == 4 and not image[..., 3].any(),
     "of one color throughout": lambda image: bool((image == image[0, 0]).all()),
 }
-"""Tests for blank photographs, by reason."""
 
 
 def set_up_pillow() -> None:
     """Raise Pillow's limit to MAX_PIXELS, and disable Ghostscript, which files of any name would start."""
     EpsImagePlugin.gs_binary = False
-    Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # PIL refuses twice as many
+    Image.MAX_IMAGE_PIXELS = MAX_PIXELS // 2  # Pillow refuses twice as many
 
 
 def in_threads(function: Callable[[S], T], items: Iterable[S]) -> list[T]:
-    """Apply a function that reads files to the items in a few threads."""
     with ThreadPoolExecutor(THREADS) as pool:
         return list(pool.map(function, items))
 
 
 def from_header(path: Path, read: Callable[[Image.Image], T], default: T) -> T:
-    """Apply `read` to an opened, undecoded image; `default` for unreadable files."""
+    """Apply `read` to an undecoded image; return `default` for unreadable files."""
     try:
         with open_picture(path) as image:
             return read(image)
-    except Exception:  # Pillow raises many kinds on broken files and EXIF
+    except Exception:  # Pillow raises many kinds
         return default
 
 
 def image_size(path: Path) -> tuple[int, int] | None:
-    """Read width and height from the header; None for unreadable files."""
+    """Read width and height; None for unreadable files."""
     return from_header(path, lambda image: image.size, None)
 
 
 def file_has_transparency(path: Path) -> bool:
-    """Test for transparency by the header; False for unreadable files."""
     return from_header(path, has_transparency, False)
 
 
@@ -69,13 +66,13 @@ def has_transparency(image: Image.Image) -> bool:
 
 
 def in_proportion(mask: tuple[int, int], photograph: tuple[int, int]) -> bool:
-    """Test if a mask (width, height) has its photograph's aspect ratio, to be resized to it."""
+    """Test if a mask (width, height) has its photograph's aspect ratio."""
     return abs(mask[0] / mask[1] / (photograph[0] / photograph[1]) - 1.0) <= PROPORTIONS
 
 
 def exposure_stops(paths: Sequence[Path]) -> list[float]:
-    """Compute log2 of the exposure of photographs from shutter time, aperture and ISO in EXIF; NaN = unknown, or with
-    other entries than most. What most lack, as the f-number of manual lenses, counts as equal for all."""
+    """Compute log2 of the exposure of photographs by EXIF; NaN = unknown, or by other entries than most state. What
+    most lack, as the f-number of manual lenses, counts as equal for all."""
     settings = in_threads(lambda path: from_header(path, exposure_settings, ()), paths)
     stated = [tuple(value is not None for value in entry) for entry in settings]
     (usual, _), *_ = Counter(filter(None, stated)).most_common(1) or [((), 0)]
@@ -84,9 +81,9 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
-    """Read a photograph of `stored` width and height (None = any) as 8-bit sRGB, mode RGB, or RGBA with transparency,
-    reduced to those `wanted` by averages over pixels; JPEGs are decoded at about twice these. Raises CaptureError: it
-    is missing, cannot be read, or has another size."""
+    """Read a photograph of `stored` size (width, height; None = any) as 8-bit sRGB, mode RGB, or RGBA with
+    transparency, reduced to the size `wanted` by averages over pixels. Raises CaptureError: it is missing, cannot be
+    read, or has another size."""
     try:
         with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:
@@ -96,7 +93,7 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
             picture = picture.convert("RGBA" if has_transparency(file) else "RGB")
             if wanted is None or picture.size == wanted == size:
                 return picture
-            # decoders round half an odd size up: the box leaves out the part beyond the photograph
+            # decoders round half sizes up: leave out what lies beyond the photograph
             return picture.resize(wanted, Image.Resampling.BOX, drafted[1] if drafted else (0, 0, *size))
     except FileNotFoundError as error:
         fail(f"the image {path} is missing, but the capture has a pose for it", error)
@@ -105,11 +102,11 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
 
 
 def eight_bits(image: Image.Image) -> Image.Image:
-    """Scale grey of more than 8 bits to 8, keeping the EXIF orientation. Raises ValueError: the range is unknown."""
+    """Scale grey of more than 8 bits to 8; keep the EXIF orientation. Raises ValueError: the range is unknown."""
     if not image.mode.startswith(("I", "F")):
         return image
     values = np.asarray(image, dtype=np.float64)
-    whites = WHITES[image.mode == "F"]  # of TIFF and others, which do not state theirs
+    whites = WHITES[image.mode == "F"]  # TIFF and others do not state theirs
     whites = (65535.0,) if image.mode.startswith("I;16") or image.format == "PNG" else whites
     grey = Image.fromarray(to_bytes(values, whites, "values"))
     turn = Image.Exif()
@@ -128,7 +125,7 @@ def to_bytes(values: npt.NDArray[np.float64], whites: Sequence[float], what: str
 
 
 def in_srgb(image: Image.Image) -> Image.Image:
-    """Convert an image with a color profile (Display P3, Adobe RGB) to sRGB."""
+    """Convert an image with a color profile to sRGB."""
     profile = image.info.get("icc_profile")
     convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
     if convert is None:
@@ -141,7 +138,7 @@ def in_srgb(image: Image.Image) -> Image.Image:
 
 @lru_cache(maxsize=8)
 def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
-    """Make the transform of an RGB profile to sRGB; None = no transform, or hardly a change."""
+    """Make the transform of an RGB profile to sRGB; None = none, or hardly a change."""
     try:
         source = ImageCms.ImageCmsProfile(BytesIO(profile))
         convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
@@ -161,11 +158,11 @@ def pixels_of(image: Image.Image) -> npt.NDArray[np.uint8]:
 
 
 def check_sizes(photographs: Sequence[Photograph]) -> None:
-    """Fail if a photograph has another size than its camera, before time is spent on the others."""
-    whole = [each for each in photographs if not each.downscaled]
-    for each, size in zip(whole, in_threads(lambda each: image_size(each.file), whole), strict=True):
-        if size not in (None, each.camera.size):  # unreadable ones are reported when they are read
-            fail(wrong_size(each.file, size, each.camera.size, each.label))
+    """Fail if a photograph has another size than its camera; unreadable ones are reported when they are read."""
+    whole = [photograph for photograph in photographs if not photograph.downscaled]
+    for photograph, size in zip(whole, in_threads(lambda it: image_size(it.file), whole), strict=True):
+        if size not in (None, photograph.camera.size):
+            fail(wrong_size(photograph.file, size, photograph.camera.size, photograph.label))
 
 
 _REPLACE = "Replace it or remove it from the capture."
@@ -173,7 +170,6 @@ _WORDED = (FileNotFoundError, Image.DecompressionBombError)
 
 
 def wrong_size(path: Path | None, size: tuple[int, int], declared: tuple[int, int], camera: str = "its camera") -> str:
-    """Explain that an image's `size` (width, height) is not the one `declared` by its camera."""
     shown = f"{size[0]} x {size[1]} pixels, but {camera} is for {declared[0]} x {declared[1]}"
     if size == declared[::-1]:
         turn = "If an EXIF tag turns it for viewers, turn its pixels: `mogrify -auto-orient <photos>`"
@@ -182,14 +178,11 @@ def wrong_size(path: Path | None, size: tuple[int, int], declared: tuple[int, in
 
 
 class ImageSummary(NamedTuple):
-    """Reason why a photograph is blank ("" = it is not), and a fingerprint, equal for equal pixels."""
-
-    empty: str
-    fingerprint: bytes
+    empty: str  # why the photograph is blank; "" = it is not
+    fingerprint: bytes  # equal for equal pixels
 
 
 def summarize(image: npt.NDArray[np.uint8]) -> ImageSummary:
-    """Summarize a photograph [H, W, 3 or 4]."""
     height, width = image.shape[:2]
     sample = image[:: max(1, height // FINGERPRINT_SIZE), :: max(1, width // FINGERPRINT_SIZE)]
     fingerprint = hashlib.sha256(repr(image.shape).encode() + sample.tobytes()).digest()

@@ -7,17 +7,17 @@ import yaml
 
 PHOTOGRAPHS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp", ".heic", ".heif", ".avif", ".jp2")
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp")
-RENDERED = b"rendered by bitymi-ns"  # Comment in pictures and films of ns-render: frames are named as photographs are
+RENDERED = b"rendered by bitymi-ns"  # Comment in pictures and films of ns-render
 
 
 @dataclass(frozen=True)
 class Kind:
     """Name files or folders, and say what they are."""
 
-    names: str  # Patterns of a shell, in lower case; NAME stands for the name of a photograph or folder.
+    names: str  # Patterns in lower case; NAME stands for the name of a photograph or folder.
     what: str  # in messages
-    of: str = ""  # patterns, one of which lies beside it; empty = none has to
-    use: str = ""  # what to do to have it used, in messages
+    of: str = ""  # patterns, one of which lies beside it
+    use: str = ""  # how to use it, in messages
     mark: str = ""  # that the file holds
 
 

@@ -22,16 +22,16 @@ from .sfm.job import MODEL, CameraGroup, Job
 from .sfm_photos import check_names, is_plain
 from .types import OPENCV_AXES, CaptureError, ColmapCamera, Photograph, fail, say, warn
 
-FEW_POINTS = 10  # per photograph, below which little is known of the scene
+FEW_POINTS = 10  # per photograph
 MIRROR = np.diag([1.0, 1.0, -1.0])
 
 
 def triangulate(
     capture: Path, views: Sequence[Photograph], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
-    """Triangulate points from photographs with known cameras, in pixels of the files; return the folder of a COLMAP
-    model in the world of the poses, with names relative to `capture`. It is cached, and interrupted runs resumed.
-    Raises CaptureError: too few points can be found."""
+    """Triangulate points from photographs with known poses, and cameras in pixels of the files; return the folder of a
+    COLMAP model in the world of the poses, with names relative to `capture`, which is cached. Raises CaptureError:
+    there are too few points."""
     check_photographs_exist(capture, [view.file for view in views])
     if len(views) < 2:
         fail(f"{capture}: points need at least two photographs with poses, these are {len(views)}")
@@ -52,10 +52,10 @@ def triangulate(
 
 
 def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -> Points | None:
-    """Triangulate points from photographs with poses; None (with a warning) if that fails."""
+    """Triangulate points; None (with a warning) if that fails."""
     middle = np.mean([photograph.pose[:3, 3] for photograph in photographs], axis=0)
     mirrored = [bool(np.linalg.det(photograph.pose[:3, :3]) < 0.0) for photograph in photographs]
-    mirror = MIRROR if all(mirrored) else np.eye(3)  # undoes mirrored poses: the photographs are not mirrored
+    mirror = MIRROR if all(mirrored) else np.eye(3)  # the photographs are not mirrored
     views = []
     for view in photographs:
         stored = (view.downscaled and image_size(view.file)) or view.camera.size

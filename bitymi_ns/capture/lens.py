@@ -1,4 +1,4 @@
-"""Lenses: resample photographs of any COLMAP or nerfstudio camera model to pinhole pictures."""
+"""Resample photographs of any COLMAP or nerfstudio camera model to pinhole pictures."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from bitymi_ns.trust import listed
 from .image_files import image_size, in_proportion, in_threads, wrong_size
 from .types import SPHERICAL_MODEL, ColmapCamera, Photograph, fail, is_full_sphere, say, scaled_size
 
-MAX_VIEW_ANGLE = 110.0  # degrees, across and down; a wider pinhole picture wastes pixels: it becomes faces of a cube
-NODE_STEP = 4  # pixels between the nodes of the distortion; interpolating between them is far more exact than a pixel
-EDGE_SAMPLES = 64  # rays per picture edge for testing what the photograph shows
+MAX_VIEW_ANGLE = 110.0  # degrees, across and down; wider pictures waste pixels
+NODE_STEP = 4  # pixels between nodes of the distortion; interpolation is far more exact than a pixel
+EDGE_SAMPLES = 64  # rays per picture edge for testing coverage
 FACES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "front": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
     "right": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)),
@@ -30,21 +30,21 @@ FACES: dict[str, tuple[tuple[float, float, float], ...]] = {
     "up": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
     "down": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
 }
-"""Right, down and forward of each face in the photograph's camera axes (OpenCV); a face spans 90 x 90 degrees."""
+"""Right, down and forward of each face of 90 x 90 degrees, in the photograph's camera axes (OpenCV)."""
 MAX_ANGLE = math.radians(89.9)  # largest angle to the axis; COLMAP's fisheye models end before 90 degrees
-NODES = 361  # rays along a side of a face at which coverage is tested
-LEAST_SHARE = 0.05  # drop faces with a smaller covered share: strips at the edge
-ANGLES, AZIMUTHS = 360, 64  # rays for testing where the distortion folds the picture
-SAMPLES = 2  # samples along a side of a face's pixel: one would alias where photographs are denser, as at their poles
+NODES = 361  # rays along a side of a face for testing coverage
+LEAST_SHARE = 0.05  # least covered share of a face: others are strips at the edge
+ANGLES, AZIMUTHS = 360, 64  # rays for testing where distortion folds the picture
+SAMPLES = 2  # along a side of a face's pixel: one aliases where photographs are denser, as at their poles
 BAND = 256  # rows of a face that are resampled together
-PAD = 2  # columns by which a 360-degree picture is continued at each side, from the other side
-NO_MAP = np.empty(0, np.float32)  # for OpenCV, where the first map has both coordinates
-CACHED_MAPS = 4  # lenses whose remapping tables are cached; 72 MB for 12 megapixels
-ABSURD_AREA = 0.05  # fail if undistorting leaves a smaller share of the photograph
+PAD = 2  # columns by which 360-degree pictures are continued at each side
+NO_MAP = np.empty(0, np.float32)  # where OpenCV's first map has both coordinates
+CACHED_MAPS = 4  # lenses; 72 MB for 12 megapixels
+ABSURD_AREA = 0.05  # least share of a photograph that undistorting leaves
 
 
 class Pinhole(NamedTuple):
-    """Pinhole camera in pixels, (0, 0) at the upper left corner of the picture."""
+    """Camera in pixels, (0, 0) at the picture's upper left corner."""
 
     fx: float
     fy: float
@@ -74,18 +74,18 @@ def _through(x: npt.ArrayLike, y: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Lens:
-    """Resampling of a photograph, or of a face of the cube around a wide camera, to a pinhole picture."""
+    """Resampling of a photograph, or of a cube face around a wide camera, to a pinhole picture."""
 
-    camera: ColmapCamera  # of the photograph, for the size to which it is downscaled first
+    camera: ColmapCamera  # of the photograph, in the size it is downscaled to first
     stored: tuple[int, int]  # width and height of the image file
     pinhole: Pinhole  # camera of the result
-    face: str = ""  # of the cube; empty = the photograph becomes one picture
-    whole: bool = True  # the photograph covers the whole result; else `coverage` is its mask
+    face: str = ""  # of the cube; empty = one picture
+    whole: bool = True  # the photograph covers the whole result
 
     @property
     def distorts(self) -> bool:
         """True if undistorting moves pixels."""
-        camera = self.camera.colmap  # pycolmap tests coefficients alone; fisheye models distort without any
+        camera = self.camera.colmap  # pycolmap tests coefficients; fisheyes distort without any
         return bool(self.face) or camera.is_perspective_fisheye() or not camera.is_undistorted()
 
     @property
@@ -103,7 +103,7 @@ class Lens:
         return covered(self.camera, self.face, self.pinhole.rays)
 
     def name(self, photograph: Path) -> Path:
-        """Name the view of a photograph, with the face of the cube."""
+        """Name the view of a photograph."""
         return photograph.with_stem(f"{photograph.stem}-{self.face}") if self.face else photograph
 
     def undistort(self, image: Image.Image) -> Image.Image:
@@ -115,15 +115,15 @@ class Lens:
         return Image.fromarray(self._moved(np.asarray(image), cv2.INTER_LINEAR), image.mode)
 
     def undistort_mask(self, mask: Image.Image | None, path: Path | None) -> Image.Image:
-        """Undistort a mask by nearest neighbors, False outside the photograph; None = everything counts. Its size may
-        differ from the photograph's, but not its aspect ratio; `path` is for the message."""
+        """Undistort a mask, False outside the photograph; None = everything counts. See `undistort_map`."""
         if mask is None:
             return Image.fromarray(self.coverage)
         pixels = self.undistort_map(np.asarray(mask).astype(np.uint8), path)
         return Image.fromarray(pixels.astype(bool) & self.coverage)
 
     def undistort_map(self, values: npt.NDArray[Any], path: Path | None) -> npt.NDArray[Any]:
-        """Undistort uint8 or float32 values [H, W] or [H, W, C] by nearest neighbors; sizes as for masks."""
+        """Undistort uint8 or float32 values [H, W] or [H, W, C] of the photograph's aspect ratio by nearest neighbors;
+        `path` is for messages."""
         size = (values.shape[1], values.shape[0])
         if not in_proportion(size, self.stored):
             fail(wrong_size(path, size, self.stored))
@@ -136,7 +136,6 @@ class Lens:
         return cv2.remap(pixels, *_maps(self), interpolation, borderMode=cv2.BORDER_REPLICATE)
 
     def _resampled(self, pixels: npt.NDArray[Any], nearest: bool) -> npt.NDArray[Any]:
-        """Resample a photograph of `camera`'s size to the face."""
         to, lens = self.pinhole, self.camera.colmap
         samples = 1 if nearest else SAMPLES
         how = cv2.INTER_NEAREST if nearest else cv2.INTER_CUBIC  # linear blurs: 1 dB on a ray-traced room
@@ -156,7 +155,6 @@ class Lens:
         return np.concatenate(bands)
 
     def downscaled(self, factor: float) -> Lens:
-        """Return the lens for pictures scaled by `factor`."""
         whole = self.pinhole
         width, height = scaled_size((whole.width, whole.height), factor)
         x, y = width / whole.width, height / whole.height
@@ -165,8 +163,8 @@ class Lens:
 
 
 def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list[Lens]:
-    """Choose the pinhole picture of a camera, for the size to which photographs are downscaled, or faces of a cube if
-    it is wider than MAX_VIEW_ANGLE. `stored`: size of the files. Raises CaptureError: the camera cannot be used."""
+    """Choose the pinhole picture of a camera, for the size to which photographs are downscaled, or cube faces if it is
+    wider than MAX_VIEW_ANGLE. `stored`: size of the files. Raises CaptureError: the camera cannot be used."""
     model, width, height, params = colmap
     camera = colmap.colmap
     if camera.is_spherical():
@@ -222,7 +220,7 @@ def make_lenses(photographs: Sequence[Photograph], downscale: int = 1, need_phot
 
 
 def _faces(colmap: ColmapCamera, stored: tuple[int, int]) -> list[Lens]:
-    """Make lenses of the cube faces that a wide camera covers, with its focal length; see `lenses_of`."""
+    """Make lenses of the cube faces that a camera covers, with its focal length."""
     camera = colmap.colmap
     around = colmap.width / (2.0 * math.pi)
     fx, fy = (around, around) if camera.is_spherical() else (camera.focal_length_x, camera.focal_length_y)
@@ -242,8 +240,8 @@ def _faces(colmap: ColmapCamera, stored: tuple[int, int]) -> list[Lens]:
 
 
 def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
-    """Measure how far the pinhole picture extends to the left, right, top and bottom of the axis, in focal lengths.
-    Maximize each side alone, then scale all until the photograph covers the corners, too."""
+    """Measure how far the pinhole picture extends to the left, right, top and bottom of the axis, in focal lengths:
+    maximize each side alone, then scale all until the photograph covers the corners, too."""
     most = math.tan(math.radians(0.5 * MAX_VIEW_ANGLE))
     reach = np.zeros(4)
 
@@ -264,14 +262,14 @@ def _window(camera: ColmapCamera) -> tuple[float, float, float, float]:
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Bisect for the largest number in [0, 1] that fits, to 24 bits; all smaller ones fit."""
+    """Bisect for the largest number in [0, 1] that fits, to 24 bits."""
     parts = 1 << 24
     return bisect_left(range(1, parts + 1), True, key=lambda part: not fits(part / parts)) / parts
 
 
 @lru_cache(maxsize=CACHED_MAPS)
 def _maps(lens: Lens) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    """Compute fixed-point maps (int16, uint16) for cv2.remap: positions in the photograph of the result's pixels."""
+    """Compute fixed-point maps (int16, uint16) for cv2.remap."""
     to = lens.pinhole
     x, y = (np.arange(0, size + NODE_STEP, NODE_STEP) + 0.5 for size in (to.width, to.height))
     rays = _through((x - to.cx) / to.fx, (y[:, None] - to.cy) / to.fy)
@@ -297,7 +295,7 @@ def covered(camera: ColmapCamera, face: str, rays: npt.NDArray[np.float64]) -> n
 
 @lru_cache(maxsize=64)
 def _field(camera: ColmapCamera) -> float:
-    """Find the largest angle to the axis up to which pixels move outwards with it, radians."""
+    """Find the largest angle to the axis up to which pixels move outwards, radians."""
     lens = camera.colmap
     angles = np.linspace(0.0, MAX_ANGLE, ANGLES + 1)[1:]
     azimuths = np.linspace(0.0, 2.0 * np.pi, AZIMUTHS, endpoint=False)
@@ -310,9 +308,9 @@ def _field(camera: ColmapCamera) -> float:
 
 
 def colmap_distortion(kind: str, values: Sequence[float], label: str) -> tuple[str, tuple[float, ...]]:
-    """Convert nerfstudio's camera type, see `transforms.CAMERA_TYPES`, and its distortion_params (k1, k2, k3, k4, p1,
-    p2; twelve of FISHEYE624) to COLMAP's model with separate focal lengths and its parameters after fx, fy, cx, cy;
-    none if SPHERICAL_MODEL. Raises CaptureError: COLMAP has no such camera, or `values` are too many or too few."""
+    """Convert nerfstudio's camera type (`transforms.CAMERA_TYPES`) and distortion_params (k1, k2, k3, k4, p1, p2;
+    twelve of FISHEYE624) to COLMAP's model and its parameters after fx, fy, cx, cy; none of SPHERICAL_MODEL. Raises
+    CaptureError: COLMAP has no such camera, or `values` are of another number."""
     if kind == "EQUIRECTANGULAR":
         return SPHERICAL_MODEL, ()
     counts = {"PERSPECTIVE": (6,), "FISHEYE": (4, 6), "FISHEYE624": (12,)}.get(kind)

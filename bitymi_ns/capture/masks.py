@@ -1,4 +1,4 @@
-"""Masks of photographs, for structure from motion and for training: finding, reading and checking them."""
+"""Masks of photographs, for structure from motion and for training."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -19,9 +19,9 @@ from .types import Photograph, fail, parsing, say
 
 LEAVE_OUT = "`bitymi-data --use-masks False` leaves masks out"  # remedy in messages
 USUAL_FOLDERS = ("images", "input", "image", "photos", "photographs", "rgb", "color")
-"""Usual folders of photographs, the most usual first."""
+"""Folders of photographs, the most usual first."""
 LOSSY = {"JPEG", "MPO", "WEBP", "JPEG2000", "HEIF", "AVIF"}
-"""Lossy formats by Pillow's names: black may come back as almost black."""
+"""Pillow's names of lossy formats: black may come back as almost black."""
 MIDDLE = 127  # threshold of lossy masks, of 255
 
 
@@ -44,8 +44,8 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
 def find_masks(
     names: Sequence[str], base: Path, masks: Path | None, stated: bool = False
 ) -> tuple[dict[str, Path], bool]:
-    """Find the masks of photographs by their names in the folder `base`: beside them unless a folder is `stated`, else
-    in the folder `masks`. Return them by name, and whether they are beside."""
+    """Find masks by the photographs' names in the folder `base`: beside them unless a folder is `stated`, else in
+    `masks`. Return them by name, and whether they are beside."""
     beside = {} if stated else _named(names, base, (*MASK.names.split(), *DYNAMIC.names.split()))
     if beside or masks is None:
         return beside, bool(beside)
@@ -53,8 +53,8 @@ def find_masks(
 
 
 def _named(names: Sequence[str], folder: Path, forms: Sequence[str]) -> dict[str, Path]:
-    """Find files in a folder whose names are of these forms, NAME a photograph's with its ending (COLMAP) or without
-    (nerfstudio), or its number alone (IDR). An upright copy has its photograph's mask."""
+    """Find files in a folder by names of these forms, with NAME a photograph's with its ending (COLMAP) or without
+    (nerfstudio), or its number (IDR). An upright copy has its photograph's mask."""
     there: dict[PurePath, dict[str, Path]] = {}
     for parent in {PurePath(name).parent for name in names}:
         files = sorted(filter(is_picture, (folder / parent).glob("*")), key=lambda file: file.suffix.lower() != ".png")
@@ -78,9 +78,8 @@ def _is_dynamic(path: Path) -> bool:
 
 
 def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
-    """Threshold a mask to the pixels [H, W] that count: not wholly transparent, and not black, or above MIDDLE for
-    lossy formats. As in COLMAP and nerfstudio, masks may hold zeros and ones, or class numbers. JPEG ripples around an
-    edge are a few levels above black, but stay below MIDDLE."""
+    """Test which pixels [H, W] of a mask count: not wholly transparent, and not black, as masks may hold zeros and ones
+    or class numbers; or above MIDDLE in lossy formats, where black has ripples around an edge."""
     if image.mode.startswith(("I", "F")):
         result = np.asarray(image) != 0
     else:
@@ -92,7 +91,7 @@ def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
 
 
 def checked_mask(path: Path) -> Image.Image:
-    """Read a mask as a 1-bit image, True where pixels count. Raises CaptureError: it is missing, or cannot be read."""
+    """Read a mask as a 1-bit image, True where pixels count. Raises CaptureError: it cannot be read."""
     if not path.exists():
         fail(f"the mask {path} is missing")
     with parsing(f"the mask {path}", "Replace it, or remove the masks from the capture."), open_picture(path) as image:
@@ -128,7 +127,7 @@ def with_masks(
 
 
 def check_masks(photographs: Sequence[Photograph]) -> None:
-    """Fail if masks are missing or cannot be used, before time is spent on the photographs."""
+    """Fail if masks are missing or cannot be used."""
     masked = {each.mask: each for each in photographs if each.mask is not None}
     missing = [mask for mask in masked if not os.path.exists(mask)]
     if missing:
@@ -136,14 +135,14 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
         fail(f"{which}. Put them there, or correct their names; {LEAVE_OUT}.")
     sizes = in_threads(image_size, masked) if masked else []
     for (mask, photograph), known in zip(masked.items(), sizes, strict=True):
-        size = known or checked_mask(mask).size  # fails with the reason
+        size = known or checked_mask(mask).size
         if not in_proportion(size, photograph.camera.size):
             fail(f"{wrong_size(mask, size, photograph.camera.size)} {LEAVE_OUT[0].upper()}{LEAVE_OUT[1:]}.")
 
 
 def write_colmap_masks(folder: Path, masks: Mapping[str, tuple[Path, tuple[int, int]]]) -> str | None:
-    """Write the masks of upright photographs, by name and with the photographs' sizes, as COLMAP reads them: grey, of
-    these sizes. Return the folder, emptied before; None = no masks."""
+    """Write the masks of upright photographs as COLMAP reads them: grey, and of the photographs' sizes, which are
+    given. Return the folder, emptied before; None = no masks."""
     emptied(folder)
     for name, (path, size) in masks.items():
         mask = checked_mask(path)

@@ -1,4 +1,4 @@
-"""Export poses as a nerfstudio capture: photographs, transforms.json, point cloud, COLMAP model."""
+"""Write poses as a nerfstudio capture: photographs, transforms.json, point cloud, COLMAP model."""
 
 import json
 import shutil
@@ -19,9 +19,8 @@ CLOUD = "sparse_pc.ply"
 
 
 def write_capture(poses: FoundPoses, folder: Path, progress: Progress) -> None:
-    """Write `images`, `sparse/0`, transforms.json, the point cloud and the report into a new or an empty folder.
-    Cameras keep the photographs' distortion; all share one world with z up. Raises OSError: it cannot be written;
-    ValueError: the folder holds something, or a name in the model leads out of it."""
+    """Write the capture, with the report, into a new or empty folder. Cameras keep the photographs' distortion. Raises
+    OSError: it cannot be written; ValueError: the folder holds something, or a name in the model leads out of it."""
 
     def check() -> None:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -45,7 +44,7 @@ def write_capture(poses: FoundPoses, folder: Path, progress: Progress) -> None:
 
 
 def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
-    """Build transforms.json: camera to world with OpenGL axes, OpenCV distortion, and common entries at the top."""
+    """Build transforms.json, camera to world with OpenGL axes."""
     frames = []
     for image in sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name):
         pose = np.vstack([image.cam_from_world().inverse().matrix(), [0, 0, 0, 1]])
@@ -58,7 +57,7 @@ def transforms(model: pycolmap.Reconstruction) -> dict[str, object]:
 
 
 def intrinsics(camera: pycolmap.Camera) -> dict[str, object]:
-    """Convert a COLMAP camera (OPENCV or one of the four simpler pinhole and radial models) to nerfstudio's entries."""
+    """Convert a COLMAP camera (OPENCV, or a simpler pinhole or radial model) to nerfstudio's entries."""
     distortion = dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)
     first = sum(len(part) for part in (camera.focal_length_idxs(), camera.principal_point_idxs()))
     distortion |= dict(zip(distortion, camera.params[first:].tolist(), strict=False))

@@ -1,4 +1,4 @@
-"""Order photographs by file name and find their neighbours."""
+"""Order photographs by name, and find their neighbours."""
 
 import re
 from bisect import bisect_left
@@ -15,7 +15,7 @@ def natural(name: str) -> list[tuple[int, int, str]]:
 
 
 class Neighbours:
-    """Sequences of photographs: files in one folder, of any cameras, whose names differ only in numbers."""
+    """Sequences of photographs: files in one folder whose names differ only in numbers."""
 
     def __init__(self, files: Sequence[Path]) -> None:
         sequences = defaultdict(list)

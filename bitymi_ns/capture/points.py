@@ -1,7 +1,5 @@
-"""Point clouds: read PLY files, choose one, and color points by photographs.
-
-nerfstudio's PLY reader returns uninitialized memory for missing points, and divides all colors by 255.
-"""
+"""Point clouds: read PLY files, choose one, and color points by photographs. nerfstudio's PLY reader returns
+uninitialized memory for missing points, and divides all colors by 255."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -21,21 +19,18 @@ from .types import CaptureError, Photograph, parsing, say
 Array = npt.NDArray[np.float64]
 VERTEX = "vertex"
 COLOR_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
-"""Names of color properties in PLY files."""
-COLOR_VIEWS = 24  # photographs, spread over all, in which colors are looked up
+COLOR_VIEWS = 24  # photographs in which colors are looked up
 COLOR_SIDE = 1000  # longer side that these are reduced to, pixels
 COLOR_CHUNK = 100_000  # points that are colored together
 GREY = 128
 STEP = 0.1  # of the distance from a camera
-MOST_COMPARED = 1_000_000  # points of a cloud that are compared with triangulated ones
+MOST_COMPARED = 1_000_000  # points of a cloud
 SAME = 0.5
 """Least share of triangulated points on the surfaces of a cloud that is used: right ones have 0.6 to 0.95, others at
 most 0.4."""
 
 
 class Points(NamedTuple):
-    """Initial points: positions [N, 3] float64 and colors [N, 3] uint8, [0, 3] without colors."""
-
     xyz: npt.NDArray[np.float64]
     rgb: npt.NDArray[np.uint8]
 
@@ -50,8 +45,8 @@ def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.ND
 
 
 def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
-    """Read the points of a PLY file, and the reason, a clause, why they have no colors; empty if they have. Raises
-    CaptureError: it is missing, or cannot be read; `remedy` says what to do."""
+    """Read the points of a PLY file, and why they have no colors, as a clause (empty if they have). Raises
+    CaptureError: it cannot be read; `remedy` says what to do."""
     with parsing(f"the point cloud {path}", remedy):
         header = read_header(path)
         points = header.elements.get(VERTEX)
@@ -71,8 +66,8 @@ def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
 
 
 def share_on(cloud: Array, points: Array, centers: Array) -> float:
-    """Measure the share of points [N, 3] on surfaces that a cloud [M, 3] shows: it lies nearer to them than to where
-    they are by STEP nearer to, or farther from, the nearest of the cameras [K, 3]. By chance a third."""
+    """Measure the share of points [N, 3] on surfaces of a cloud [M, 3]: it lies nearer to them than to where they are
+    by STEP nearer to, or farther from, the nearest of the cameras [K, 3]. By chance a third."""
     tree = cKDTree(cloud[np.isfinite(cloud).all(1)][:: 1 + len(cloud) // MOST_COMPARED])
     step = STEP * (centers[cKDTree(centers).query(points)[1]] - points)
     here, nearer, farther = (tree.query(points + sign * step)[0] for sign in (0.0, 1.0, -1.0))
@@ -82,8 +77,8 @@ def share_on(cloud: Array, points: Array, centers: Array) -> float:
 def cloud_beside(
     folder: Path, points: Points | None, photographs: Sequence[Photograph], placed: Callable[[Points], Points]
 ) -> Points | None:
-    """Read a PLY file in a folder that nothing names: the first on whose surfaces most of the triangulated `points`
-    lie; None = none. `placed` moves points of files to the poses' world. Report others."""
+    """Read the first PLY file in a folder on whose surfaces most of the triangulated `points` lie; None = none.
+    `placed` moves points of files to the poses' world. Report others."""
     centers = np.stack([each.pose[:3, 3] for each in photographs])
     for path in sorted(path for path in folder.iterdir() if kind_of(path, CLOUDS)):
         try:
@@ -102,7 +97,7 @@ def cloud_beside(
 
 
 def with_colors(points: Points, without: str, photographs: Sequence[Photograph], source: Path) -> Points:
-    """Color points that have no colors, for the reason `without`, or black ones only; see `color_points`."""
+    """Color points that have no colors, for the reason `without`, or only black ones."""
     if not without and not points.rgb.any():
         without = "its own are all black"
     if not without or not len(points.xyz):

@@ -1,4 +1,4 @@
-"""Check poses: rotations (or mirrored ones), positions that belong together, and points in their unit."""
+"""Check poses: rotations (also mirrored), positions that belong together, and points in their unit."""
 
 import os
 from collections.abc import Sequence
@@ -13,24 +13,24 @@ import numpy.typing as npt
 from bitymi_ns.trust import listed
 from .types import FrameOptions, Photograph, fail, say, warn
 
-EXACT = 1e-3  # error of rotations taken as they are: float32, or four written digits
-ROUNDED = 2e-2  # error of rounded rotations, up to a common factor: two written digits
-FAR = 100.0  # distance relative to the others' from which a camera may be misplaced
+EXACT = 1e-3  # error of rotations taken as they are: four digits
+ROUNDED = 2e-2  # error of rounded rotations: two digits
+FAR = 100.0  # relative distance from which a camera may be misplaced
 TOO_FAR = 1000.0  # relative distance that shrinks the other cameras to one point
-FAR_FROM_ORIGIN = 100.0  # distance from the origin, relative to that from their middle, at which float32 blurs cameras
-OTHER_UNIT = 150.0  # ratio of points' and cameras' distances, or of picture and cloud, that tells another unit
+FAR_FROM_ORIGIN = 100.0  # relative distance from the origin at which float32 blurs cameras
+OTHER_UNIT = 150.0  # ratio of distances, or of picture and cloud, that tells another unit
 USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
 """Median distance of cameras from their middle in half sides of the scene box: NeRF-Synthetic's, and the largest in the
 format's unit."""
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
-    """Recover rotations, or mirrored ones, from the 3 x 3 parts [N, 3, 3] of poses, camera to world: divide out each
-    matrix's factor, and undo rounding by the nearest rotation; valid ones stay equal. `names` of the frames and
-    `source` are for messages. Raises CaptureError: a matrix is not finite, zero or sheared."""
+    """Recover rotations, also mirrored, from the 3 x 3 parts [N, 3, 3] of poses: divide out each matrix's factor, and
+    undo rounding by the nearest rotation; valid ones stay equal. `names` and `source` are for messages. Raises
+    CaptureError: a matrix is not finite, zero or sheared."""
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
-    largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares of the numbers may overflow
+    largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares may overflow
     usable = largest > 0.0
     unit = np.where(usable[:, None, None], matrices, 1.0) / np.where(usable, largest, 1.0)[:, None, None]
     length = np.sqrt(np.square(unit).sum((1, 2)) / 3.0)
@@ -63,7 +63,7 @@ def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source
 
 
 def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
-    """Check the poses of a transforms.json's frames, one for each photograph, and make rotations of them."""
+    """Check the poses of a transforms.json's frames, and make rotations of them."""
     names = [frame["file_path"] for frame in frames]
     poses, scaled = [], []
     for frame, name in zip(frames, names, strict=True):
@@ -72,7 +72,7 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
             fail(f"{path}: the transform_matrix of {name} is not 4 x 4 finite numbers. Correct it or remove the frame.")
         if pose[3, 3] and not pose[3, :3].any():
             scaled += [name] * bool(abs(pose[3, 3] - 1.0) > 1e-6)  # numpy 2.5 multiplies no list by its own
-            pose = pose / pose[3, 3]  # homogeneous: a factor on all 16 numbers says nothing
+            pose = pose / pose[3, 3]  # homogeneous
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             what = f"the last row of the transform_matrix of {name} is {' '.join(f'{x:g}' for x in pose[3])}"
             fail(f"{path}: {what}, not 0 0 0 1. If its position stands there, transpose the matrix.")
@@ -100,7 +100,7 @@ def as_matrix(value: Any) -> np.ndarray | None:
 
 
 def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Warn of frames that are mirrored against the others; rotations [N, 3, 3], `names` for messages."""
+    """Warn of frames mirrored against the others; rotations [N, 3, 3]."""
     mirrored = np.linalg.det(rotations) < 0.0
     few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
     if few.any():
@@ -115,7 +115,7 @@ def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
 
 
 def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
-    """Warn of single cameras far from all others, or fail; centers [N, 3] finite, `names` for messages."""
+    """Warn of single cameras far from all others, or fail; centers [N, 3] are finite."""
     distances = np.linalg.norm(centers - np.median(centers, axis=0), axis=1)
     order = np.argsort(distances)
     near, far = distances[order][:-1], distances[order][1:]
@@ -139,7 +139,7 @@ def far_from_origin(centers: npt.NDArray[np.float64]) -> bool:
 
 def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: str) -> FrameOptions:
     """Reduce the scale of a capture whose cameras lie far outside the scene box, as in millimetres: random points would
-    all be one spot of the pictures. `frame`: the format's default, without auto_scale_poses."""
+    all be one spot of the pictures. `frame`: the format's default."""
     centers = np.stack([photograph.pose[:3, 3] for photograph in photographs])
     spread = float(np.median(np.linalg.norm(centers - centers.mean(0), axis=1)))
     ratio = spread * frame.scale_factor / frame.scene_scale
@@ -154,15 +154,14 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
 def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
-    """Warn if points [N, 3] seem to be in another unit than finite camera positions [M, 3]; `widths` [M] of the
-    pictures in focal lengths. Such points are far beyond the cameras or a spot of the pictures, and training starts
-    from next to nothing. Medians and percentiles are robust to outliers."""
+    """Warn if points [N, 3] seem to be in another unit than finite cameras [M, 3]: far beyond these, or a spot of the
+    pictures, whose `widths` [M] are in focal lengths."""
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]
     if len(points) == 0:
         return
     middle, cloud_middle = np.median(centers, axis=0), np.median(points, axis=0)
-    apart = np.percentile(np.linalg.norm(centers - middle, axis=1), 90)  # a median may be that of a group on a tripod
+    apart = np.percentile(np.linalg.norm(centers - middle, axis=1), 90)  # most may stand on one tripod
     away = np.median(np.linalg.norm(points - middle, axis=1))
     spread = np.median(np.linalg.norm(points - cloud_middle, axis=1))
     picture = np.median(np.linalg.norm(centers - cloud_middle, axis=1) * widths)  # picture width at the cloud

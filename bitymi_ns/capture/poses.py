@@ -33,8 +33,8 @@ from .sfm_report import write_report
 from .types import SPHERICAL_MODEL, ColmapCamera, FoundPoses, SfmOptions, fail, is_full_sphere
 from .video import NO_MOTION, extract_frames
 
-GUESSED_FOCAL = 1.2  # initial focal length if unknown, in longer sides; COLMAP's own
-TELLING = 0.25  # least share of what looks like 360-degree pictures among photographs for all of them to be some
+GUESSED_FOCAL = 1.2  # COLMAP's own, in longer sides
+TELLING = 0.25  # least share of what looks like 360-degree pictures for all to be some
 LEAST = 3  # fewest photographs
 SPARSE = Path("sparse/0")  # the model's path in a result
 
@@ -47,8 +47,8 @@ def find_poses(
     capture: Path | None = None,
 ) -> FoundPoses:
     """Find camera poses of photographs (of a folder, or its `images`) or of a video's frames; cache them, and continue
-    an interrupted run. `warn` is told what is left out; `capture`: folder that may hold the masks, too. Raises
-    CaptureError: no poses can be found; says what to photograph differently."""
+    an interrupted run. `warn` is told what is left out; `capture`: folder that may hold masks, too. Raises
+    CaptureError: there are no poses; says what to photograph differently."""
     options = options or SfmOptions()
     tell = progress or no_progress
     source, folder, names = _photographs_in(Path(source))
@@ -83,7 +83,7 @@ def find_poses(
 
 
 def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
-    """Return the source, its folder of photographs and their names; for a video no names."""
+    """Return the source, its folder of photographs and their names (none of a video)."""
     if source.suffix.lower() in VIDEOS and source.is_file():
         return source, source, []
     if not source.exists():
@@ -106,11 +106,11 @@ def _photographs_in(source: Path) -> tuple[Path, Path, list[str]]:
 
 
 def _finished(work: Path, folder: Path) -> FoundPoses | None:
-    """Read an earlier run's poses by poses.json, which marks complete results; None = none, or damaged ones."""
+    """Read an earlier run's poses by poses.json, which marks complete results; None = none, or damaged."""
     result = work / "result"
-    with suppress(OSError, ValueError, LookupError, AttributeError, TypeError):  # damaged in any way
+    with suppress(OSError, ValueError, LookupError, AttributeError, TypeError):
         kept = read_json(result / "poses.json")
-        made = kept.pop("made")  # photographs of the model are copies or frames in the work folder
+        made = kept.pop("made")  # its photographs are copies or frames in the work folder
         images = work / sfm_photos.IMAGES if made else Path(os.path.abspath(folder))
         values = {**kept, "model": result / SPARSE, "images": images, "report": result}
         poses = TypeAdapter(FoundPoses).validate_python(values)
@@ -194,7 +194,7 @@ def _with_panoramas(source: Path, photos: list[Photo], left_out: dict[str, str],
 
 
 def ordered(photos: list[Photo]) -> list[Photo]:
-    """Sort by time if all photographs have one and they differ; else keep the order by name."""
+    """Sort by time if all photographs have one and they differ."""
     times = {photo.exif.time for photo in photos}
     return sorted(photos, key=lambda photo: photo.exif.time) if "" not in times and len(times) > 1 else photos
 
@@ -208,8 +208,8 @@ def make_job(
     work: Path,
     sequence: bool,
 ) -> Job:
-    """Make the job of these photographs in their order, linked in the work folder under plain names. `images`: folder
-    of the upright photographs, `used` their names in it; in a `sequence` neighbours overlap."""
+    """Make the job of photographs in this order, linked in the work folder under plain names. `images`: folder of the
+    upright photographs, `used` their names in it; in a `sequence` neighbours overlap."""
     links, plain = emptied(work / "links"), {}
     for i, photo in enumerate(photos):
         plain[photo.name] = f"{i:06d}{Path(used[photo.name]).suffix.lower()}"

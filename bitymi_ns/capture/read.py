@@ -30,7 +30,7 @@ from .splits import NameLists, SplitOptions, choose_split, lists_by_name, read_s
 from .transforms import Transforms, check_number, read_transforms
 from .types import FrameOptions, Orientation, Photograph, Pose, SfmSettings, fail, say, warn
 
-Choice = Literal["auto", "triangulate", "random"]  # auto = the capture's points, else triangulated ones
+Choice = Literal["auto", "triangulate", "random"]  # auto: the capture's, else triangulated
 WITH_MODEL = ("colmap", "photographs", "video")  # formats read as a COLMAP model
 SCANNED = ("polycam", "record3d", "3d-scanner", "stray-scanner", "pose-files")  # with poses of scanners
 FRAMED = ("nerfstudio", *WITH_MODEL, *SCANNED)  # whose poses are oriented, centered and scaled
@@ -44,16 +44,16 @@ OPTION_FORMATS: dict[str, tuple[str, ...]] = {
     "sfm": ("photographs", "video"),
     "poses_as": ("nerfstudio", "instant-ngp", "blender", "colmap", *SCANNED),
 }
-"""Formats of options that are not for all formats."""
+"""Formats of options that are not for all."""
 CONVENTIONS: dict[str, tuple[Reading, Pose]] = {
     "colmap": (Reading("opencv", "w2c", "wxyz"), TO_Z_UP), "pose-files": (Reading("opencv"), np.eye(4)),
     "polycam": (Reading(), Y_UP), "record3d": (Reading(order="xyzw"), Y_UP), "3d-scanner": (Reading(), Y_UP),
     "stray-scanner": (Reading("opencv", "c2w", "xyzw"), Y_UP),
 }  # fmt: skip
-"""Conventions of formats, with the transform of their world; of others camera to world with OpenGL axes."""
-OF_EARLIER_TOOL = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])  # applied, but not stated
-NGP_SCALE = 0.3333  # factor on positions of instant-ngp's captures, as in nerfstudio's reader
-BLENDER_SIDE = 1.5  # half the side of a Blender data set's box, as in nerfstudio's reader
+"""Conventions of poses, with the transform of their world; others are camera to world with OpenGL axes."""
+OF_EARLIER_TOOL = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
+NGP_SCALE = 0.3333  # factor on positions, as in nerfstudio's reader
+BLENDER_SIDE = 1.5  # half the box's side, as in nerfstudio's reader
 
 
 def check_options(options: Any, call: Callable[[str], str] = str) -> None:
@@ -72,7 +72,7 @@ def check_options(options: Any, call: Callable[[str], str] = str) -> None:
 
 @contextmanager
 def _naming_files() -> Iterator[None]:
-    """Convert an OSError to a CaptureError that names the file; a decorator."""
+    """Convert an OSError to a CaptureError that names the file."""
     try:
         yield
     except OSError as error:
@@ -81,7 +81,7 @@ def _naming_files() -> Iterator[None]:
 
 @dataclass
 class CaptureOptions(SplitOptions, FrameOptions):
-    """Options of reading a capture: path, format, files, points, frame and split."""
+    """Options of reading a capture."""
 
     data: Path = Path()
     """Folder, or file: transforms.json or video."""
@@ -125,17 +125,17 @@ class Capture:
 
     format: Format
     source: str  # names it in messages
-    photographs: list[Photograph]  # in the order of their names, Blender's train, val and test after one another
+    photographs: list[Photograph]  # by name, Blender's train, val and test after one another
     points: Points | None  # to start from; None = random ones
     frame: FrameOptions
-    lists: NameLists = field(default_factory=lambda: NameLists({}))  # its own lists for training and evaluation
-    parts: dict[str, Sequence[int]] = field(default_factory=dict)  # photographs of "train", and held out "val", "test"
-    downscale: int = 1  # factor by which photographs are reduced
-    applied: Pose | None = None  # transform [4, 4] that its files state as applied, with a scale
+    lists: NameLists = field(default_factory=lambda: NameLists({}))  # its own
+    parts: dict[str, Sequence[int]] = field(default_factory=dict)  # of "train", and of held out "val" and "test"
+    downscale: int = 1
+    applied: Pose | None = None  # [4, 4], as its files state
     applied_scale: float = 1.0
     declares_box: bool = False  # its files state the box of the scene
     poses_as: str = AUTO  # name of the reading of its poses
-    report: Path | None = None  # folder of the report on structure from motion; None = none
+    report: Path | None = None  # on structure from motion
     model: Source | None = None  # found by structure from motion; None = the capture came with poses
 
 
@@ -144,8 +144,8 @@ def read_capture(
     options: CaptureOptions, need_photos: bool = True, want_points: bool = True, found: Found | None = None
 ) -> Capture:
     """Read a capture of any format, and check all that its files state. `need_photos`: fail if photographs are missing,
-    else open none; `want_points`: color and triangulate points; `found`: what `options.find` has found. Raises
-    CaptureError: it cannot be used; names the file and the entry, and says what to do."""
+    else open none; `want_points`: color and triangulate points; `found`: result of `options.find`. Raises CaptureError:
+    it cannot be used; names the file and the entry, and says what to do."""
     return _Reader(options, found or options.find(), need_photos, want_points).read()
 
 
@@ -156,7 +156,7 @@ class _Reader:
     need_photos: bool
     want_points: bool
     poses_as: str = AUTO
-    mirror: Pose = field(default_factory=lambda: np.eye(4))  # reflection of the world if that is left-handed
+    mirror: Pose = field(default_factory=lambda: np.eye(4))  # reflection of a left-handed world
 
     def read(self) -> Capture:
         found = self.found
@@ -191,7 +191,7 @@ class _Reader:
     def _prepared(
         self, photographs: list[Photograph], folder: Path, base: Path | None = None, images: Path | None = None
     ) -> list[Photograph]:
-        """Add masks, see `with_masks`, and replace photographs by smaller copies in a `folder`, see `downscaled`."""
+        """Add masks, and replace photographs by smaller copies; see `with_masks` and `downscaled`."""
         stated = self.options.masks_path
         masked = self.options.use_masks and (stated is not None or not any(each.mask for each in photographs))
         if self.need_photos and masked and self.found.format != "video":
@@ -229,7 +229,7 @@ class _Reader:
         return Capture(found.format, source, photographs, points, frame, read.lists, **of_file)
 
     def _colmap(self) -> Capture:
-        """Read a COLMAP model, of photographs without poses by structure from motion, and lists of names beside it."""
+        """Read a COLMAP model, which structure from motion may find, and lists of names beside it."""
         options, found, need_photos = self.options, self.found, self.need_photos
         if found.format == "colmap":
             source = find_source(found, options.images_path, self.downscale, need_photos)
@@ -266,7 +266,7 @@ class _Reader:
 
     def _blender(self) -> Capture:
         """Read a Blender data set with its own split. If one of the val and test files is missing, or lacks all its
-        photographs, the other serves for both; without either there is no split."""
+        photographs, the other serves for both."""
         options, found, need_photos = self.options, self.found, self.need_photos
         train = self._read_transforms(found.folder / SPLITS[0])
         every, named, source = list(train.photographs), set(train.named), str(train.path)
@@ -293,7 +293,7 @@ class _Reader:
         self, what: str, photographs: Sequence[Photograph], named: Iterable[Path | None], source: str
     ) -> list[Photograph]:
         """Report what is read; fail if photographs or masks are missing. If it came with poses, report pictures beside
-        them that are not `named`, and give photographs the poses that they are meant to have; see `as_meant`."""
+        them that are not `named`, and give photographs the poses that they are meant to have (`as_meant`)."""
         text = [f"Reading {what}.", self.found.how_to_choose()]
         if self.found.format == "instant-ngp" and self.options.format == "auto":  # a guess: both use one name
             text.append("If nerfstudio wrote it: `bitymi-data --format nerfstudio`.")
@@ -317,12 +317,12 @@ class _Reader:
         return with_colors(points, without, photographs, source) if self.want_points else points
 
     def _placed(self, points: Points) -> Points:
-        """Mirror points of files as the poses are."""
+        """Mirror points as the poses are."""
         return points._replace(xyz=points.xyz @ self.mirror[:3, :3].T + self.mirror[:3, 3])
 
     def _points(self, own: Points | None, photographs: Sequence[Photograph], source: str) -> Points | None:
         """Choose the points to start from: of --ply-path, the capture's `own`, those of a PLY file beside it that shows
-        the same surfaces as triangulated ones, or these; None = random ones. `source` is for messages."""
+        the same surfaces as triangulated ones, or these; None = random ones."""
         auto, folder = self.options.points == "auto", self.found.folder
         if self.options.points == "random":
             return None

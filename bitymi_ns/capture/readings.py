@@ -1,5 +1,5 @@
-"""Decide by the photographs how poses and intrinsics of a capture are to be read: match pairs of photographs without
-their poses, and count the matches that each reading explains."""
+"""Decide how poses and intrinsics of a capture are to be read: match pairs of photographs without their poses, and
+count the matches that each reading explains."""
 
 import os
 import shlex
@@ -35,21 +35,21 @@ SWAPPED, NO_DISTORTION = "sides-swapped", "no-distortion"
 INTRINSICS = {f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2.0, 4.0, 8.0)}
 """Factors on focal lengths and principal points, as of pictures of another size."""
 ENOUGH = 100  # matches that decide
-FITS = 0.5  # least share of matches that poses explain, relative to what the pairs' own poses explain
+FITS = 0.5  # least share of matches that poses explain, relative to the pairs' own poses
 LEAD = 2.0
 """Least ratio of what a reading explains to what poses explain as written: at most 0.26 in captures that are right as
 written, at least 3.9 in others."""
-CLIPS, CLIP = 6, 6  # runs of photographs that are consecutive by name, and photographs of each
-SIDE = 500  # longer side that photographs are reduced to, pixels; twice as much of 360-degree pictures
-FEATURES, COARSE = 1500, 128  # features of a photograph; largest ones that decide on likeness
-RATIO = 0.8  # most ratio of the distances of a feature's nearest and second nearest
-PAIRS, TRIALS = 20, 80  # pairs wanted, and pairs matched at most
-ALIKE = 8  # least matches of coarse features of a pair that is not near by name
-LEAST, OWN = 15, 0.4  # least matches of a pair, and share of them, that its own essential matrix explains
-SAMPLES = 1000  # random samples in the search for that matrix, at most
-MOTION = 0.05  # least median motion between the photographs of a pair, in longer sides
-TOLERANCE = 0.004  # largest distance to the epipolar plane, in longer sides; matches that move less tell nothing
-STILL = 1e-4  # baseline, relative to the largest coordinate of a camera, below which cameras are at one place
+CLIPS, CLIP = 6, 6  # runs of photographs consecutive by name, and photographs of each
+SIDE = 500  # longer side of reduced photographs, pixels; twice that of 360-degree pictures
+FEATURES, COARSE = 1500, 128  # per photograph; largest ones that decide on likeness
+RATIO = 0.8  # largest ratio of a feature's nearest and second distance
+PAIRS, TRIALS = 20, 80  # wanted, and most that are matched
+ALIKE = 8  # least coarse matches of a pair that is not near by name
+LEAST, OWN = 15, 0.4  # least number and share of a pair's matches that its own essential matrix explains
+SAMPLES = 1000  # most random samples in the search for it
+MOTION = 0.05  # least median motion of a pair, in longer sides
+TOLERANCE = 0.004  # largest distance to the epipolar plane, and least motion of a match, in longer sides
+STILL = 1e-4  # baseline of cameras at one place, relative to the largest coordinate
 
 
 class Reading(NamedTuple):
@@ -63,7 +63,7 @@ class Reading(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Name of the option --poses-as."""
+        """Name for --poses-as."""
         return "-".join(filter(None, self))
 
 
@@ -113,11 +113,11 @@ class Pair(NamedTuple):
     second: int
     x: Array
     y: Array
-    own: Array  # [3, 4] pose of the second camera against the first one's that explains most matches
+    own: Array  # [3, 4] first camera to second, by the matches
 
 
 def match_pairs(photographs: Sequence[Photograph]) -> list[Pair]:
-    """Match pairs of photographs that are near by name or look alike, and move; their poses are not used."""
+    """Match pairs of photographs that are near by name or look alike, and move."""
     order = sorted(range(len(photographs)), key=lambda i: natural(str(photographs[i].file)))
     if len(order) > CLIPS * CLIP:
         order = list(dict.fromkeys(order[i + k] for i in spread(len(order) - CLIP + 1, CLIPS) for k in range(CLIP)))
@@ -156,7 +156,7 @@ def _features(photograph: Photograph) -> Features:
 
 
 def _mutual(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> npt.NDArray[np.int64]:
-    """Match features [n, 128] and [m, 128], each the other's nearest by far; return their indices [k, 2]."""
+    """Match features [n, 128] and [m, 128], each the other's nearest by far; return indices [k, 2]."""
     if min(len(a), len(b)) < 2:
         return np.zeros((0, 2), np.int64)
     cosine = a @ b.T
@@ -201,7 +201,7 @@ def explained(
     pairs: Sequence[Pair], rays: Sequence[tuple[Array, Array, Array]], poses: Array | None = None
 ) -> npt.NDArray[np.int64]:
     """Count the matches of each pair [P] whose rays, see `rays_of`, meet in front of both cameras. `poses`: [N, 4, 4]
-    camera to world with OpenGL axes, of all photographs; None = the pairs' own."""
+    camera to world with OpenGL axes; None = the pairs' own."""
     counts = np.zeros(len(pairs), np.int64)
     to_world = np.eye(4)[None] if poses is None else poses @ OPENCV_AXES
     to_camera, least = np.linalg.inv(to_world), STILL * np.abs(to_world[:, :3, 3]).max()
@@ -224,7 +224,7 @@ class Decision(NamedTuple):
 
 def decide(photographs: Sequence[Photograph], poses: Array, written: Reading) -> Decision:
     """Find the reading by which the poses explain by far most of what pairs of photographs have in common; as written
-    if there is too little of that, or a camera cannot be used."""
+    if that is too little, or a camera cannot be used."""
     cameras, every = [each.camera for each in photographs], readings(written)
     lenses = [camera.colmap for camera in dict.fromkeys(cameras)]
     focals = [value for lens in lenses for value in lens.params[lens.focal_length_idxs()]]
@@ -257,8 +257,8 @@ def as_meant(
     photographs: Sequence[Photograph], written: Reading, frame: Array, source: str, asked: str
 ) -> tuple[list[Photograph], Array, str]:
     """Give photographs the poses and intrinsics of the reading `asked` for (AUTO = the photographs decide), and say so;
-    return them, the reflection [4, 4] of their world, and the reading's name. `frame`: transform [4, 4] from the world
-    of the files to that of the photographs. Raises CaptureError: the format has no such reading."""
+    return them, the reflection [4, 4] of their world, and the reading's name. `frame`: [4, 4] from the world of the
+    files to that of the photographs. Raises CaptureError: the format has no such reading."""
     named = {WRITTEN: written} | {each.name: each for each in readings(written)}
     poses, decision = np.linalg.inv(frame) @ np.stack([each.pose for each in photographs]), Decision(named.get(asked))
     if asked == AUTO:

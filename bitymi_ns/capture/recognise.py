@@ -1,4 +1,4 @@
-"""Recognize the format of a folder or file: a capture with poses, photographs, or a video."""
+"""Recognize the format of a capture: poses in files, photographs, or a video."""
 
 import os
 import struct
@@ -19,7 +19,7 @@ Format = Literal[
     "pose-files", "photographs", "video",
 ]  # fmt: skip
 
-MODELS = ("sparse/0", "colmap/sparse/0", "sparse")  # usual folders of a COLMAP model, the most usual first
+MODELS = ("sparse/0", "colmap/sparse/0", "sparse")  # of COLMAP, the most usual first
 NERFSTUDIOS_OWN = {"ply_file_path", "applied_transform", "camera_model", "orientation_override", "train_filenames"}
 """Entries of a transforms.json that only nerfstudio writes."""
 POLYCAM = (("corrected_images", "corrected_cameras"), ("images", "cameras"))
@@ -34,14 +34,13 @@ INTRINSICS = {"fl_x", "fl_y", "cx", "cy", "w", "h"}
 class Found:
     format: Format  # to read it as
     path: Path
-    """nerfstudio, instant-ngp: transforms.json; blender, photographs: the folder; colmap: that of the model; video: the
-    file."""
+    """nerfstudio, instant-ngp: transforms.json; colmap: the model's folder; video: the file; else a folder."""
     folder: Path  # of the capture, to which names in its files are relative
     beside: tuple[tuple[Format, Path], ...] = ()  # captures beside it that are not read
-    unread: tuple[str, ...] = ()  # files of poses that are not read, with what converts them
+    unread: tuple[str, ...] = ()  # files of poses, and what converts them
 
     def how_to_choose(self) -> str:
-        """Describe captures that are not read, and how to read them; empty if there are none."""
+        """Describe captures that are not read, and how to read them; empty = none."""
         ways = []
         for format, path in self.beside:
             option = f"--format {format}"
@@ -54,9 +53,9 @@ class Found:
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
-    """Recognize the capture of a `format` (auto = any, files with poses before photographs without) at a path: a
-    folder, transforms.json, a video, or a file of a COLMAP model. `colmap_path`: folder of a COLMAP model, relative to
-    the capture. Raises CaptureError: there is none of that format."""
+    """Recognize the capture of a `format` (auto = any, poses before photographs without) at a folder, or a file:
+    transforms.json, a video, or of a COLMAP model. `colmap_path`: folder of a COLMAP model, relative to the capture.
+    Raises CaptureError: there is none."""
     if not data.exists():
         fail(f"the capture {data} does not exist. Give a folder or a file with --data.")
     if colmap_path is not None:
@@ -71,7 +70,7 @@ def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path
     if data.is_dir() and all(kind in ("photographs", "video") for kind, _ in fitting):
         if (within := _capture_within(data, format)) is not None:
             return recognise(within, format)
-    if format in TWINS and not fitting:  # the user knows better than the entries of the file
+    if format in TWINS and not fitting:  # the user knows better
         fitting = [(format, path) for kind, path in candidates if kind in TWINS]
     if not fitting:
         fail(_nothing(data, format, candidates))
@@ -120,7 +119,7 @@ def _in_folder(folder: Path) -> Iterator[tuple[Format, Path]]:
 def _transforms_in(folder: Path) -> Iterator[tuple[Format, Path]]:
     """Yield transforms.json and Blender's files, else JSON files of other names that hold camera transforms."""
     usual = folder / "transforms.json"
-    # folders and broken links of these names count, so that reading them reports an error
+    # folders and broken links count: reading them reports an error
     there, splits = (os.path.lexists(path) for path in (usual, folder / SPLITS[0]))
     if there:
         yield _kind_of(usual), usual
@@ -162,13 +161,12 @@ def _kind_of(file: Path) -> Format:
 
 
 def is_model(folder: Path) -> bool:
-    """Test for the cameras of a COLMAP model."""
     return any(os.path.isfile(folder / name) for name in ("cameras.bin", "cameras.txt"))
 
 
 def models_in(data: Path) -> list[Path]:
     """List COLMAP models at most three levels below a folder, relative to it: usual folders first, and of numbered
-    models side by side (COLMAP writes several if it cannot connect all photographs) those with most images."""
+    models side by side, of parts of a scene, those with most images."""
     folders = {path.parent for depth in ("", "*/", "*/*/", "*/*/*/") for path in data.glob(f"{depth}cameras.*")}
     models = [path.relative_to(data) for path in folders if is_model(path)]
 
@@ -194,7 +192,7 @@ def image_count(model: Path) -> int:
 
 def _photographs_in(folder: Path) -> Path | None:
     """Choose the folder to search for photographs: this one if it or its `images` holds some, or several subfolders do;
-    else the same within the only subfolder that does. None = no photographs, or subfolders that are captures."""
+    else the same within the only subfolder that does. None = no photographs, or subfolders are captures."""
     if folder_contents.photographs_in(folder) or any(folder_contents.photographs_below(folder / "images")):
         return folder
     holding = [path for path in folder_contents.folders_in(folder) if any(folder_contents.photographs_below(path))]
@@ -204,7 +202,7 @@ def _photographs_in(folder: Path) -> Path | None:
 
 
 def captures_in(folder: Path) -> list[Path]:
-    """List the subfolders whose `images` hold photographs, as captures of their own; empty if there is only one."""
+    """List the subfolders whose `images` hold photographs, as captures of their own, if several."""
     folders = folder_contents.folders_in(folder)
     captures = [path for path in folders if any(folder_contents.photographs_below(path / "images"))]
     return captures if len(captures) > 1 else []

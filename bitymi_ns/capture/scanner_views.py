@@ -23,8 +23,6 @@ from .types import OPENCV_AXES, ColmapCamera, Photograph, Pose, fail, parsing, w
 
 
 class ScannedPhotograph(NamedTuple):
-    """Photograph as a scanner states it."""
-
     file: Path
     pose: Pose  # in nerfstudio's axes
     pinhole: tuple[float, ...]  # fx, fy, cx, cy
@@ -33,13 +31,13 @@ class ScannedPhotograph(NamedTuple):
 
 
 AGAIN = "Export the capture again."
-MOST_POSE = 1 << 20  # bytes of a file with a pose or a camera
+MOST_POSE = 1 << 20  # bytes of a pose or a camera
 Y_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """Transform of ARKit's world, y up, to z up."""
 
 
 def scanner_photographs(found: Found) -> list[Photograph]:
-    """Read photographs with cameras and poses, in the order of their names. Raises CaptureError: a file is damaged."""
+    """Read photographs with cameras and poses by name. Raises CaptureError: a file is damaged."""
     readers: dict[str, Callable[[Path], list[ScannedPhotograph]]] = {
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
         "3d-scanner": _scanner_app, "stray-scanner": _stray_scanner,
@@ -188,14 +186,13 @@ def _images(folder: Path, *names: str) -> dict[str, Path]:
 
 
 def _pose(values: Sequence[float]) -> Pose:
-    """Convert a quaternion xyzw and a position to [4, 4]."""
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[:4]).as_matrix(), values[4:]
     return pose
 
 
 def _numbers(values: Any, count: int) -> list[float]:
-    """Convert to floats. Raises ValueError unless there are `count`: numpy would repeat or drop some."""
+    """Convert to `count` floats, else raise ValueError: numpy would repeat or drop some."""
     numbers = [float(value) for value in values]
     if len(numbers) != count:
         raise ValueError(f"it has {len(numbers)} numbers, not {count}")

@@ -1,7 +1,5 @@
-"""Photographs for structure from motion: find them, and read size, EXIF, thumbnail and sharpness of each.
-
-360-degree pictures are told by metadata or content: phones take other photographs with an aspect ratio of 2.
-"""
+"""Photographs for structure from motion: find and read them. 360-degree pictures are told by metadata or content:
+phones take other photographs with an aspect ratio of 2."""
 
 import os
 import re
@@ -32,17 +30,17 @@ PLAIN = {
 JPEG_QUALITY = 97
 IMAGES = "images"  # subfolder of the work folder for upright copies, or a video's frames
 COPY = ".jpg"  # appended to a photograph's name for its upright copy
-THUMB = 256  # longer side of grey thumbnails for duplicate detection, pixels
+THUMB = 256  # longer side of grey thumbnails, pixels
 SHARPNESS_SIZE = 1024  # longer side for measuring sharpness, pixels
-BLURRED = 0.5  # largest share of the median sharpness of a blurred photograph
-DUPLICATE_SHIFT = 0.1  # shift in pixels of thumbnails that explains the difference of duplicates
-HEADER = 1 << 17  # bytes at the start of a file that are searched for metadata
+BLURRED = 0.5  # largest share of the median sharpness
+DUPLICATE_SHIFT = 0.1  # pixels of thumbnails; see `shift`
+HEADER = 1 << 17  # bytes searched for metadata
 SPHERICAL = re.compile(rb"GPano:ProjectionType|ProjectionType[^a-z]{1,8}(equirectangular|cylindrical)", re.IGNORECASE)
 """XMP entries of panoramas (Google Photo Sphere)."""
 ALIKE = 0.6  # least correlation of the details of matching left and right edges
-SMOOTH = 15  # rows of the moving average that is subtracted to leave detail
+SMOOTH = 15  # rows of the moving average that is no detail
 DETAIL = 1.5  # least standard deviation of detail, grey levels: bare edges always match
-POLE = 0.35  # largest standard deviation of the first and last row, the sphere's poles, relative to the picture's
+POLE = 0.35  # largest standard deviation of the first and last row, relative to the picture's
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ class Photo:
     width: int  # upright, as the height
     height: int
     exif: Exif
-    plain: bool  # usable as it is: upright, in a format that everything reads
+    plain: bool  # upright, in a format that everything reads
     thumb: np.ndarray  # [h,w] float32 grey levels, longer side THUMB
     sharpness: float  # see `sharpness`
     panorama: bool = False  # a 360-degree picture
@@ -60,7 +58,7 @@ class Photo:
 
 
 def find_photos(folder: Path) -> list[str]:
-    """List the photographs in and below a folder in natural order. Raises CaptureError: the folder cannot be read."""
+    """List the photographs in and below a folder in natural order. Raises CaptureError: it cannot be read."""
     try:
         os.listdir(folder)
         paths = list(photographs_below(folder))
@@ -70,7 +68,7 @@ def find_photos(folder: Path) -> list[str]:
 
 
 def check_names(folder: Path, names: Sequence[str]) -> None:
-    """Check that names are UTF-8, as COLMAP and JSON need. Raises CaptureError: a name or the folder's path is not."""
+    """Check that names are UTF-8, as COLMAP and JSON need. Raises CaptureError."""
     where = os.path.realpath(folder)
     if wrong := [name for name in (where, *names) if not is_text(name)]:
         advice = "rename it (`convmv -r -f latin1 -t utf8 --notest FOLDER` does so for names in an older encoding)"
@@ -96,7 +94,7 @@ def read_photos(folder: Path, names: list[str], progress: Progress) -> tuple[lis
 
 
 def read_photo(folder: Path, name: str) -> Photo:
-    """Read a photograph to its last byte. Raises CaptureError: it cannot be read; the message lacks its name."""
+    """Read a photograph to its last byte. Raises CaptureError, without its name: it cannot be read."""
     path = folder / name
     try:
         with open_picture(path) as image:
@@ -124,7 +122,6 @@ def read_photo(folder: Path, name: str) -> Photo:
 
 
 def has_panorama_metadata(path: Path) -> bool:
-    """Test a file's metadata for a spherical or cylindrical projection."""
     with suppress(OSError), open_regular(path) as file:
         return SPHERICAL.search(file.read(HEADER)) is not None
     return False
@@ -156,7 +153,7 @@ def _reduced(image: Image.Image, side: int) -> Image.Image:
 
 
 def sharpness(grey: np.ndarray) -> float:
-    """Compute the ratio of the root mean squares of Laplacian and gradient of [h,w] float32: low without detail."""
+    """Compute the ratio of the root mean squares of Laplacian and gradient of [h,w] float32."""
     right, down = np.diff(grey, axis=1), np.diff(grey, axis=0)
     gradient = float(np.mean(right**2) + np.mean(down**2))
     laplacian = float(np.mean(np.diff(right, axis=1) ** 2) + np.mean(np.diff(down, axis=0) ** 2))
@@ -176,7 +173,7 @@ def upright_photos(
     photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
 ) -> tuple[Path, dict[str, str]]:
     """Write upright JPEG copies of the photographs that need one. Return the folder to read (`folder` itself if none
-    does, else `images` in the work folder, with links to the others), and the names in it by photograph."""
+    does, else one with links to the others), and the names in it by photograph."""
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
     names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}
@@ -204,12 +201,12 @@ def blurred(photos: Sequence[Photo]) -> list[str]:
 
 
 def duplicates(photos: Sequence[Photo]) -> dict[str, str]:
-    """Map near-duplicates to the sharper photograph of the same picture, by name; see `shift`."""
+    """Map near-duplicates to the sharper photograph of the same picture, by name."""
     sharper: dict[str, str] = {}
     kept: list[tuple[float, Photo]] = []
     for photo in sorted(photos, key=lambda photo: -photo.sharpness):
         level, thumb = float(photo.thumb.mean()), photo.thumb
-        # a duplicate has almost the same mean: compare few pixel by pixel
+        # duplicates have almost the same mean: compare few pixel by pixel
         near = (twin for mean, twin in kept if abs(mean - level) < 2.0 and twin.thumb.shape == thumb.shape)
         twin = next((twin for twin in near if shift(thumb, twin.thumb) < DUPLICATE_SHIFT), None)
         if twin is not None:

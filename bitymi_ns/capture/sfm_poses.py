@@ -1,4 +1,4 @@
-"""Poses of photographs and videos by structure from motion, and the copy that a training run keeps."""
+"""Poses found by structure from motion, and the copy that a training run keeps."""
 
 import json
 import os
@@ -23,12 +23,10 @@ from .types import SfmOptions, SfmSettings, fail, parsing, say, warn
 
 MODEL = Path("sparse/0")
 IMAGES = "images"
-ORIGIN = "origin.json"  # file of the model's `Origin`; a folder without it holds at most a report
+ORIGIN = "origin.json"  # of the model's `Origin`
 
 
 class KeptPoses(NamedTuple):
-    """Poses in the folder of a run."""
-
     folder: Path  # holds MODEL, the report, and IMAGES if these are upright copies or frames
     origin: Origin  # its photographs are IMAGES if it names no folder
     left_out: Mapping[str, str]  # photographs without a pose, and why
@@ -40,8 +38,8 @@ class KeptPoses(NamedTuple):
 
 
 def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings, use_masks: bool = True) -> Source:
-    """Run structure from motion on photographs or a video, or find an earlier run's model. `masks_path` is relative to
-    the capture, None = find it. Raises CaptureError: no poses can be found; says what to photograph differently."""
+    """Find poses of photographs or a video, or those of an earlier run. `masks_path` is relative to the capture, None =
+    find it. Raises CaptureError: see `find_poses`."""
     from bitymi_ns.progress import rich_progress
     from .poses import find_poses  # slow to import
 
@@ -64,7 +62,7 @@ def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings
 
 
 def kept_source(found: Found, kept: KeptPoses, need_photos: bool) -> Source:
-    """Return the model of a run. Raises CaptureError: needed photographs are missing, or have changed their size."""
+    """Return the model of a run. Raises CaptureError: needed photographs are missing, or have another size."""
     photographs = kept.origin.photographs
     images = kept.folder / IMAGES if photographs is None else found.folder / photographs
     model = kept.folder / MODEL
@@ -88,7 +86,7 @@ def kept_source(found: Found, kept: KeptPoses, need_photos: bool) -> Source:
 
 
 def has_kept_poses(folder: Path) -> bool:
-    """Test for poses kept in a run's folder; earlier versions kept the report alone."""
+    """Test for poses in a run's folder; earlier versions kept the report alone."""
     return (folder / ORIGIN).is_file()
 
 

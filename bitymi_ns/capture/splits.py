@@ -113,9 +113,9 @@ def by_names(names: Sequence[Path], wanted: Sequence[str], source: str) -> Split
 
 
 def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
-    """Split by a capture's own lists; "val" and "test" are held out, without them what is not in "train"."""
+    """Split by lists; "val" and "test" are held out, without them what is not in "train"."""
 
-    def indices(split: str) -> set[int]:  # downscaled photographs are in another folder than the lists state
+    def indices(split: str) -> set[int]:  # downscaled photographs are in other folders
         return set(find_named(names, lists.names.get(split, []), lists.source, any_folder=True))
 
     every, train, held_out = set(range(len(names))), indices("train"), indices("val") | indices("test")
@@ -141,8 +141,8 @@ def _names_in(path: Path, what: object) -> list[str]:
 
 
 def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLists:
-    """Read the lists of names of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`; else
-    3DGS's `test.txt` in the model's folder, which may name more than the photographs' `files`."""
+    """Read the lists of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`; else 3DGS's
+    `test.txt` in the model's folder, which may name more than the photographs' `files`."""
     stated = [(row.what, folder / name) for row in LISTS for name in row.names.split()]
     lists, test = {split: _names_in(path, path) for split, path in stated if path.is_file()}, model / "test.txt"
     if lists or not test.is_file():

@@ -1,7 +1,5 @@
-"""Read the JSON files of captures: nerfstudio's transforms.json, instant-ngp's, and Blender's.
-
-Each entry is read from the frame first, then from the top of the file. Unused entries are reported.
-"""
+"""Read transforms.json of nerfstudio, instant-ngp and Blender. Each entry is read from the frame first, then from the
+top of the file."""
 
 import math
 import os
@@ -48,7 +46,7 @@ USED = {
     *INTRINSICS, *DISTORTION, *FOCALS[0], *FOCALS[1],
 }  # fmt: skip
 IRRELEVANT = {"rotation", "sharpness", "colmap_im_id", "made_by"}  # unused entries that are not reported
-UNKNOWN_SIZE = 800  # pixels along the sides of missing pictures of unstated size, where none are needed
+UNKNOWN_SIZE = 800  # pixels along the sides of missing pictures, where none are needed
 
 
 @dataclass(frozen=True)
@@ -61,8 +59,8 @@ class Transforms:
 
 
 def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_masks: bool = True) -> Transforms:
-    """Read a JSON file in any Unicode encoding, check it, make poses rotations, and find its photographs, maps and
-    masks. Raises CaptureError: the file cannot be used; names the frame."""
+    """Read a JSON file, check it, make poses rotations, and find its photographs, maps and masks. Raises CaptureError:
+    the file cannot be used; names the frame."""
     if not os.path.lexists(path):
         fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
     with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
@@ -201,7 +199,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
         return None
 
     width, height, cx, cy = (None if (entry := value(key)) is None else entry[1] for key in ("w", "h", "cx", "cy"))
-    if width is None or height is None:  # missing pictures are reported when they are read, if any are
+    if width is None or height is None:  # missing pictures are reported when they are read
         size = image_size(file) or (height or UNKNOWN_SIZE, width or UNKNOWN_SIZE)
         width, height = width or size[0], height or size[1]
     middle = (width / 2.0 if cx is None else cx, height / 2.0 if cy is None else cy)
@@ -222,7 +220,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
 
 
 def _focal_length(path: Path, key: str, value: float, side: float) -> float:
-    """Convert an entry of FOCALS to pixels; the picture's `side` is in pixels."""
+    """Convert an entry of FOCALS to pixels; `side` of the picture is in pixels."""
     if key.startswith("fl_"):
         return value
     angle = math.radians(value) if key.endswith("fov") else value
@@ -233,7 +231,6 @@ def _focal_length(path: Path, key: str, value: float, side: float) -> float:
 
 
 def _distortion(path: Path, meta: dict[str, Any], frame: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
-    """Convert camera model and distortion of a frame; see `colmap_distortion`."""
     label = f"of {frame['file_path']}"
     model = frame.get("camera_model", meta.get("camera_model", "OPENCV"))
     if not isinstance(model, str) or model not in CAMERA_TYPES:

@@ -1,4 +1,4 @@
-"""Types of the package: `CaptureError`, photographs and cameras, options of captures and of structure from motion."""
+"""Types of the package: `CaptureError`, photographs and cameras, options."""
 
 import logging
 from contextlib import AbstractContextManager
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 Pose = npt.NDArray[np.float64]
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # [4, 4] between camera frames with OpenCV axes and with OpenGL's
-SPHERICAL_MODEL = "EQUIRECTANGULAR"  # COLMAP camera model of 360-degree pictures; its parameters are width and height
+SPHERICAL_MODEL = "EQUIRECTANGULAR"  # COLMAP's model of 360-degree pictures, with parameters width and height
 ASPECT = 0.01  # relative tolerance of the aspect ratio 2 of 360-degree pictures
 Orientation = Literal["pca", "up", "vertical", "none"]
 
@@ -26,11 +26,11 @@ ones of a room with a box of equal faces 0.20 and 0.27."""
 
 
 class CaptureError(ValueError):
-    """Error in a capture, photographs or a video; the message names the problem, the file and the remedy."""
+    """Error in a capture, photographs or a video; names the problem, the file and the remedy."""
 
 
 _log = logging.getLogger("bitymi_ns.capture")
-say, warn = _log.info, _log.warning  # report what is read, and what is missing, in one line each
+say, warn = _log.info, _log.warning  # one line each
 
 
 def fail(message: str, cause: BaseException | None = None) -> NoReturn:
@@ -49,7 +49,7 @@ MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")  # extensions of d
 
 @dataclass(frozen=True)
 class MapFiles:
-    """Files of depth and normals beside a photograph; None = none."""
+    """Files of depth and normals beside a photograph."""
 
     depth: Path | None = None  # camera z, see `read_depth`
     confidence: Path | None = None  # of the depth, 0 = low; no larger than the depth map
@@ -68,7 +68,7 @@ def scaled_size(size: tuple[int, int], factor: float) -> tuple[int, int]:
 
 
 class ColmapCamera(NamedTuple):
-    """Camera model of COLMAP, width and height of the pictures in pixels, and parameters in COLMAP's order."""
+    """Camera model of COLMAP, picture size in pixels, and parameters in COLMAP's order."""
 
     model: str
     width: int
@@ -77,12 +77,11 @@ class ColmapCamera(NamedTuple):
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height, pixels."""
         return self.width, self.height
 
     @property
     def colmap(self) -> "pycolmap.Camera":
-        from . import pycolmap  # slow, and not needed for options
+        from . import pycolmap  # slow
 
         return pycolmap.Camera(model=self.model, width=self.width, height=self.height, params=list(self.params))
 
@@ -111,11 +110,11 @@ class ColmapCamera(NamedTuple):
 class Photograph:
     file: Path
     camera: ColmapCamera  # in pixels before downscaling
-    pose: Pose  # [4, 4] float64, camera to world, OpenGL axes (camera: x right, y up, z backward)
+    pose: Pose  # [4, 4] camera to world, OpenGL axes (camera: x right, y up, z backward)
     label: str  # names the camera in messages
     mask: Path | None = None
     downscaled: bool = False  # `file` is a downscaled copy
-    frame: int | None = None  # shared by photographs that a rig took together; None = it stands alone
+    frame: int | None = None  # of a rig that took several together
     maps: MapFiles = MapFiles()
 
 
@@ -171,16 +170,15 @@ class SfmOptions(SfmSettings):
 @dataclass(frozen=True)
 class FoundPoses:
     model: Path
-    """Folder of a COLMAP model (cameras.bin, images.bin, points3D.bin) in full-size pixels of `images`, distorted as
-    they are. frame.json in `report` states its up and metres, as far as they are known."""
-    images: Path  # Folder that image names are relative to: of the photographs, of upright copies or of frames.
-    report: Path  # Folder with report.json, report.md, cameras.png and frame.json.
+    """Folder of a COLMAP model in full-size pixels of `images`, distorted as they are."""
+    images: Path  # Folder of the photographs, upright copies or frames.
+    report: Path  # Folder with report.json, cameras.png and frame.json.
     left_out: dict[str, str]  # Photographs that have no pose, by name, and why.
     registered: int  # Number of photographs that have a pose.
     given: int  # Number of photographs, or of frames taken of a video.
     reprojection_error: float  # Mean over all observations, in pixels of the photographs.
     track_length: float  # Mean number of photographs that see a point.
-    seconds: dict[str, float]  # Wall time per stage of the run that found the poses.
+    seconds: dict[str, float]  # Wall time per stage.
     contradicted: float = 0.0  # Share of the verified matches that the poses contradict.
 
     @property

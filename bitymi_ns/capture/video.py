@@ -22,22 +22,22 @@ from .types import fail, warn
 
 SMALL = 160  # longer side of frames for measuring motion, pixels
 FINE = 640  # longer side of frames for measuring sharpness, pixels
-STRIDE = 0.08  # motion between extracted frames in longer sides: neighbors share about 90 %
+STRIDE = 0.08  # between extracted frames, in longer sides: neighbors share about 90 %
 FEWEST, MOST = 20, 300  # frames of a video whose camera moves
-STILL = 0.02  # motion over a video in longer sides, below which the camera stood still
-PER_SECOND = 15  # frames surveyed per second by their timestamps: the rate of phones varies with the light
+STILL = 0.02  # least motion over a video, in longer sides
+PER_SECOND = 15  # frames surveyed per second of timestamps: the rate of phones varies with the light
 TRUSTED = {
     "format_whitelist": "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegts,mpegvideo",
     "protocol_whitelist": "file",
 }
 """FFmpeg options: a file of any name may be a list of files and URLs to read."""
-LEAST_SURVEYED = 60  # least number of surveyed frames: all of a clip of a second or two
+LEAST_SURVEYED = 60  # all of a clip of a second or two
 NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene, with it in view"
-PQ, HLG = 16, 18  # transfer functions of high dynamic range, as ITU-T H.273 numbers them
+PQ, HLG = 16, 18  # transfer functions of high dynamic range (ITU-T H.273)
 BT2020 = 9  # matrix of luma and chroma of such films
-WHITE = 203.0  # cd/m^2 of white paper in such films (ITU-R BT.2408), which becomes a screen's white
-HLG_PEAK, HLG_GAMMA = 1000.0, 1.2  # peak luminance and gamma of HLG's reference display (ITU-R BT.2100)
-KNEE = 0.8  # share of white up to which light is kept; brighter light is compressed to white
+WHITE = 203.0  # cd/m^2 of white paper (ITU-R BT.2408), which becomes a screen's white
+HLG_PEAK, HLG_GAMMA = 1000.0, 1.2  # of HLG's reference display (ITU-R BT.2100)
+KNEE = 0.8  # share of white from which light is compressed to white
 LUMA = np.array([0.2627, 0.6780, 0.0593])  # luma coefficients of BT.2020
 TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0182, -0.1006, 1.1187]])
 """BT.2020's linear red, green and blue to those of BT.709 and sRGB."""
@@ -45,7 +45,7 @@ TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0
 
 def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -> Path:
     """Write the frames of a video with `poses` known poses beside it, as they are stored; see `extract_frames`. Raises
-    CaptureError: it cannot be read, or has another number of frames."""
+    CaptureError: it has another number of frames."""
 
     def extract(work: Path) -> None:
         total = _pace(video)[2]
@@ -71,7 +71,7 @@ def extract_frames(video: Path, work: Path, count: int | None, progress: Progres
     wanted = count or int(np.clip(round(motion[-1] / STRIDE), FEWEST, MOST))
     numbers = {seen[i] for i in choose(np.array(motion), np.array(sharp), wanted)}
     with complete_folder(target) as folder:
-        with _opened(video) as container:  # pixels of some camcorders and anamorphic lenses are not square
+        with _opened(video) as container:  # pixels may not be square
             shape = float(_pictures(container).sample_aspect_ratio or 1.0)
             shape = shape if 0.25 < shape < 4.0 else 1.0
         chosen_frames = islice(((i, frame) for i, frame in _frames(video) if i in numbers), len(numbers))
@@ -138,7 +138,7 @@ def displacement(first: np.ndarray, second: np.ndarray) -> float:
                 continue
             product = np.fft.rfft2((a - a.mean()) * window) * np.conj(np.fft.rfft2((b - b.mean()) * window))
             peak = np.fft.irfft2(product / np.maximum(np.abs(product), 1e-6), s=window.shape)
-            # a parabola through the peak and its neighbours finds parts of a pixel
+            # finds parts of a pixel
             row, column = map(int, np.unravel_index(peak.argmax(), peak.shape))
             shift = (_between(peak[:, column], row), _between(peak[row], column))
             lengths.append(math.hypot(*(s - n * (s > n / 2) for s, n in zip(shift, window.shape, strict=True))))
@@ -246,7 +246,7 @@ def _picture(frame: av.VideoFrame, shape: float = 1.0) -> Image.Image:
 
 
 def tone_mapped(frame: av.VideoFrame) -> Image.Image:
-    """Convert a high dynamic range frame to 8-bit sRGB, without which it is pale."""
+    """Convert a high dynamic range frame to 8-bit sRGB."""
     frame.colorspace = BT2020  # some cameras do not state it
     signal = frame.to_ndarray(format="rgb48le").astype(np.float32) / 65535.0
     nits = pq_to_nits(signal) if frame.color_trc == PQ else hlg_to_nits(signal)

@@ -1,1 +1,1 @@
-"""Structure from motion by COLMAP, in a process of its own: `process.run` starts it, `worker` is what runs there."""
+"""Structure from motion by COLMAP in a process of its own: `process.run` starts it, `worker` runs there."""

@@ -17,10 +17,10 @@ from bitymi_ns.capture.types import ColmapCamera
 
 DATABASE = "database.db"
 PAIRS = "pairs.txt"
-MODEL = "model"  # names in the work folder: COLMAP's database, pairs to match, and the resulting model
+MODEL = "model"  # in the work folder
 
-MAX_ERROR = 4.0  # largest error of observations, in pixels of the images with features; COLMAP's own limit
-SERIAL = 100  # most photographs that one thread maps, for equal results of equal runs; for 50, two are no faster
+MAX_ERROR = 4.0  # of observations, in pixels of the images with features; COLMAP's own limit
+SERIAL = 100  # most photographs that one thread maps, for equal results; for 50, two are no faster
 
 
 class StageProgress(Protocol):
@@ -31,7 +31,7 @@ class StageProgress(Protocol):
 
 @dataclass(frozen=True)
 class CameraGroup:
-    """Photographs taken by one camera at one focal length."""
+    """Photographs of one camera at one focal length."""
 
     camera: ColmapCamera  # in pixels of the photographs
     prior: bool  # the focal length is known
@@ -62,8 +62,8 @@ class Job:
 
     @property
     def threads(self) -> int:
-        """Number of threads for mapping and triangulation; -1 = all. Several sum in varying order, so that poses of the
-        same photographs differ by rounding, which grows along the way."""
+        """Threads for mapping and triangulation; -1 = all. Several sum in varying order: poses differ by rounding,
+        which grows."""
         return 1 if len(self.order) <= SERIAL else -1
 
     @property
@@ -89,4 +89,4 @@ class Job:
 
 
 class NoPoses(Exception):
-    """Failure to find poses of the photographs; the message says what to do."""
+    """There are no poses; the message says what to do."""

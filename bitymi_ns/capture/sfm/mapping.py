@@ -14,19 +14,19 @@ from .job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
 from .model_checks import contradicted, drop_unlinked
 
 Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
-"""Function that maps a database's features and matches, given a folder for files; returns connected components."""
-ENOUGH = 0.9  # share of the connected photographs in a global model that is good enough
-GOOD_ERROR = 1.0  # and its reprojection error, in pixels of the images with features, if few matches contradict it
+"""Maps a database's features and matches, given a folder for files; returns connected components."""
+ENOUGH = 0.9  # share of the connected photographs in a good global model
+GOOD_ERROR = 1.0  # and its reprojection error, in pixels of the images with features
 
 MIN_ANGLE = 1.5  # least angle between rays of a point with depth, degrees; COLMAP's own limit
-GAIN = 0.03  # least relative drop of the reprojection error to choose OPENCV: few observations overfit its four terms
-OBSERVATIONS_PER_CAMERA = 2000  # least for OPENCV
+GAIN = 0.03  # least relative drop of the reprojection error to choose OPENCV
+OBSERVATIONS_PER_CAMERA = 2000  # least for OPENCV: fewer overfit its four terms
 LEAST_POINTS = 10  # to start from
-TELLING = 100  # least matches of all pairs that blame poses which give no points from them
+TELLING = 100  # least matches of all pairs that blame the poses
 
 
 def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
-    """Find the best model of the photographs; None = none. Verified pairs connect `connected` of them."""
+    """Find the best model of the photographs, of which verified pairs connect `connected`; None = none."""
     model = None if job.mapper == "incremental" else _mapped(_global, job, database, tell)
     if job.mapper == "global":
         return model
@@ -38,7 +38,7 @@ def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -
 
 
 def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) -> pycolmap.Reconstruction | None:
-    """Choose the model with most cameras, of equals that which fewest matches contradict; None = none."""
+    """Choose the model with most cameras, of equals that which fewest matches contradict."""
     known = [model for model in models if model is not None]
     most = max((model.num_reg_images() for model in known), default=0)
     equal = [model for model in known if model.num_reg_images() == most]

@@ -12,20 +12,19 @@ from bitymi_ns.capture.types import SPHERICAL_MODEL
 from bitymi_ns.files import write_file
 from .job import PAIRS, CameraGroup, Job, StageProgress
 
-SMALL = 1000  # photographs with a shorter longer side, pixels, are doubled; larger ones have enough features
+SMALL = 1000  # pixels; photographs with a shorter longer side are doubled
 SPHERICAL_SCALE = 2
 """Factor on `SMALL` and the largest image size for 360-degree pictures, whose details are small: with half the
-features, their camera positions were wrong by a metre among perspective photographs."""
+features, camera positions were wrong by a metre among perspective photographs."""
 FEW = 30  # most photographs that are all compared with all
 WORTH_ALL = 150  # most that are, if too few get a pose otherwise
 NEIGHBOURS = 20  # photographs that each is compared with, by likeness or by GPS
 COARSE_FEATURES = (256, 128)
-"""Numbers of features per photograph that decide on likeness, for up to MANY photographs and for more: the largest,
-which are found from afar as well as close by."""
+"""Features per photograph, of the largest, that decide on likeness, for up to MANY photographs and for more."""
 MANY = 400
-COARSE_COSINE = 0.85  # least cosine between descriptors of like features, each the other's nearest
+COARSE_COSINE = 0.85  # least cosine between descriptors of like features
 SEQUENCE_NEIGHBOURS = 6
-SEQUENCE_SHARE = 0.8  # least share of consecutive photographs in a sequence that are among each other's most alike
+SEQUENCE_SHARE = 0.8  # least share of consecutive photographs that are among the most alike
 
 
 def extract(job: Job, database: Path, tell: StageProgress) -> None:
@@ -37,7 +36,7 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
     for group, camera_id in ids:
         camera = {"camera_model": group.camera.model, "existing_camera_id": camera_id}
         groups.append((group, pycolmap.ImageReaderOptions(**camera, mask_path=job.masks or "")))
-    for group, reader in groups:  # before extraction, whose threads would number the photographs in any order
+    for group, reader in groups:  # extraction's threads would number them in any order
         pycolmap.import_images(database, job.images, image_names=group.names, options=reader, **single)
     for group, reader in groups:
         options = {"reader_options": reader, "extraction_options": _extraction(job, group), **single}
@@ -47,7 +46,7 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
 
 
 def camera_ids(job: Job, database: Path) -> list[int]:
-    """Write the groups' cameras that the database lacks after an earlier run, and return the ids of all."""
+    """Write the groups' cameras that the database lacks, and return the ids of all."""
     with pycolmap.Database.open(database) as opened:
         for group in job.cameras[opened.num_cameras() :]:
             camera = group.camera.colmap
@@ -137,7 +136,7 @@ def nearest_neighbours(alike: np.ndarray, neighbours: int) -> set[tuple[int, int
 
 
 def sequence(count: int) -> set[tuple[int, int]]:
-    """Pair each photograph with those that follow it, and with farther ones at powers of two."""
+    """Pair each photograph with those that follow it, and with some farther ones."""
     steps = sorted({*range(1, SEQUENCE_NEIGHBOURS + 1), 8, 16})
     return {(i, i + step) for i in range(count) for step in steps if i + step < count}
 

@@ -1,4 +1,4 @@
-"""Check a model, and explain why photographs have no pose, and what to photograph differently."""
+"""Check a model, explain why photographs have no pose, and what to photograph differently."""
 
 from collections import Counter
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from scipy.spatial.transform import Rotation
 from bitymi_ns.capture import pycolmap
 from .job import MAX_ERROR, CameraGroup, Job, NoPoses
 
-LINK = 15  # points seen together that link two photographs; COLMAP's least number of inliers of a pair
+LINK = 15  # points that link two photographs; COLMAP's least inliers of a pair
 FEW_FEATURES = 60  # features of a photograph with hardly any detail
 PARALLAX = 1.0  # largest parallax (`parallax`) of photographs from one spot, degrees
-ROTATED = 2.0  # error up to which a rotation alone explains a match, in pixels of the images with features
+ROTATED = 2.0  # error up to which a rotation explains a match, in pixels of the images with features
 MOST = 0.9
-"""Least share of a pair's matches, and of the pairs, that a rotation explains if the camera only turned: if it moved
-before a far background, a rotation explains fewer."""
+"""Least share of a pair's matches, and of the pairs, that a rotation explains if the camera only turned; fewer if it
+moved before a far background."""
 PAIRS_TRIED = 60
 TELLING = 30  # fewest matches of a pair that tell a rotation from a translation
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)  # unknown focal lengths, in longer sides
@@ -30,8 +30,6 @@ FROM_ONE_SPOT = "the photographs were taken from one spot, which tells nothing o
 
 @dataclass(frozen=True)
 class ViewGraph:
-    """Matches between photographs."""
-
     features: dict[str, int]  # per photograph
     inliers: dict[tuple[str, str], int]  # matches per pair that fit a common geometry
 
@@ -95,7 +93,7 @@ def why_none(job: Job, graph: ViewGraph) -> NoPoses:
 
 
 def parallax(model: pycolmap.Reconstruction) -> float:
-    """Compute the median over the points of the widest angle between two rays, in degrees."""
+    """Compute the median over the points of the widest angle between two rays, degrees."""
     centers = {image.image_id: image.projection_center() for image in model.images.values() if image.has_pose}
     ids = list(model.point3D_ids())
     angles = []
@@ -147,9 +145,9 @@ def _pixels_per_radian(camera: pycolmap.Camera) -> float:
 
 
 def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
-    """Measure distances [n] in pixels of unit rays a, b [n, 3] after the best rotation; `focal`: pixels per radian."""
+    """Measure distances [n] in pixels of unit rays [n, 3] after the best rotation; `focal`: pixels per radian."""
     keep = np.ones(len(a), bool)
-    for _ in range(3):  # least squares, then without the worst half, which has the wrong matches
+    for _ in range(3):  # then without the worst half, which has the wrong matches
         turn, _ = Rotation.align_vectors(b[keep], a[keep])
         distances = np.linalg.norm(turn.apply(a) - b, axis=1) * focal
         keep = distances <= np.median(distances)
@@ -157,8 +155,8 @@ def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Remove the poses of cameras that too few points link to the largest group: they are arbitrary. Mappers register
-    such cameras by directions between pairs, whose points the filters may have removed."""
+    """Remove the poses of cameras that too few points link to the largest group: mappers register them by directions
+    between pairs, whose points the filters may have removed."""
     placed = [image for image in model.images.values() if image.has_pose]
     column = {image.image_id: i for i, image in enumerate(placed)}
     tracks = [sorted({column[e.image_id] for e in p.track.elements}) for p in model.points3D.values()]

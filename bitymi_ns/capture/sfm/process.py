@@ -19,7 +19,7 @@ from bitymi_ns.trust import no_links, python_command
 from .job import DATABASE, PAIRS, Job
 
 LOG = "colmap.log"
-LITTLE_SPACE = 50_000_000  # free bytes below which a failure counts as a full disk
+LITTLE_SPACE = 50_000_000  # free bytes that count as a full disk
 
 
 def run(job: Job, source: Path, progress: Progress) -> dict[str, Any]:
@@ -58,8 +58,8 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, Any]:
 
 @contextmanager
 def _watched(database: Path, table: str, progress: Progress, stage: str, total: int) -> Iterator[None]:
-    """Report the rows of a table of COLMAP's database while COLMAP fills it. Rows are counted in this process: COLMAP's
-    copy of SQLite and Python's in one process would release each other's file locks."""
+    """Report the rows of a table while COLMAP fills it. They are counted in this process: COLMAP's SQLite and Python's
+    in one process would release each other's file locks."""
     ended = threading.Event()
 
     def watch() -> None:
@@ -76,7 +76,7 @@ def _watched(database: Path, table: str, progress: Progress, stage: str, total: 
 
 
 def rows(database: Path, table: str) -> int:
-    """Count the rows of a table; 0 if it cannot be read. Not in a process in which COLMAP has the database open."""
+    """Count the rows of a table; 0 if it cannot be read."""
     where = f"{database.absolute().as_uri()}?mode=ro"
     with suppress(sqlite3.Error), closing(sqlite3.connect(where, uri=True, timeout=5)) as connection:
         return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
@@ -84,7 +84,7 @@ def rows(database: Path, table: str) -> int:
 
 
 def delete_work(work: Path, *folders: str) -> None:
-    """Delete features, matches and pairs from a work folder, and its subfolders `folders`."""
+    """Delete features, matches, pairs and `folders` from a work folder."""
     for name in (DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm", PAIRS):
         with suppress(OSError):
             (work / name).unlink()

@@ -1,8 +1,6 @@
-"""Run COLMAP in this process, by `main`: a Job on stdin, lines of JSON on stdout.
-
-A line is {"stage", "done", "total", "counts"}, or at the end {"result"} or {"failure"}. The process ends with its
-stdin. Prints of COLMAP and its libraries go to stderr.
-"""
+"""Run COLMAP in this process: a Job on stdin, lines of JSON on stdout. A line is {"stage", "done", "total", "counts"},
+or at the end {"result"} or {"failure"}. The process ends with its stdin. Prints of COLMAP and its libraries go to
+stderr."""
 
 import json
 import os
@@ -12,7 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pycolmap  # in this process with its signal handlers, which write the stack of a crash to the log
+import pycolmap  # with its signal handlers, which log the stack of a crash
 
 from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.files import complete_folder, write_errors_as
@@ -45,7 +43,7 @@ def send(**line: object) -> None:
 
 
 def find(job: Job, stages: Stages) -> tuple[pycolmap.Reconstruction, dict[str, object]]:
-    """Find poses of a job's photographs; return the model and statistics. Raises NoPoses: there are none."""
+    """Find poses of a job's photographs; return the model and statistics. Raises NoPoses."""
     database = Path(job.work) / DATABASE
     matching.extract(job, database, stages)
     matching.match(job, database, stages)

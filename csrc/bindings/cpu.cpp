@@ -1,6 +1,5 @@
 // Module bitymi_ns._cpu, or one of another name for other CPU features. Operations take the fields of their struct
-// (csrc/ops) as keyword arguments; the caller allocates; shapes and dtypes are checked here (reader.h), values in
-// Python.
+// (csrc/ops) as keyword arguments; shapes and dtypes are checked here (reader.h), values in Python.
 #include <nanobind/stl/optional.h>
 
 #include <cstdlib>

@@ -38,7 +38,7 @@ void bind_operation(nb::module_& m, const std::string& name, void (*run)(const A
   });
 }
 
-// Binds one call that steps many parameters: a list of dictionaries, each with the arguments for one parameter.
+// Binds one call for many parameters: a list of dictionaries of arguments.
 template <class S> void bind_adam(nb::module_& m, const std::string& name) {
   m.def(
       name.c_str(),

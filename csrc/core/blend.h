@@ -18,8 +18,7 @@ template <class S> BT_HD Vec3<S> shaded(Vec3<S> base, Vec3<S> residual) {
   return {shaded(base.x, residual.x), shaded(base.y, residual.y), shaded(base.z, residual.z)};
 }
 
-// Gradients through the ReLUs: the residual's passes where the outer one is open, the view colour's, from the sum of
-// the residual's, where the inner one is open too.
+// Gradients through the ReLUs: the residual's where the outer one is open, the view colour's where both are.
 template <class T> BT_HD T residual_gradient(T color, T dcolor) { return select(color > T(0.0f), dcolor, T(0.0f)); }
 template <class S> BT_HD Vec3<S> residual_gradient(Vec3<S> color, Vec3<S> dcolor) {
   return {residual_gradient(color.x, dcolor.x), residual_gradient(color.y, dcolor.y),
@@ -43,7 +42,7 @@ template <class T> BT_HD Blend<T> blend(T sigma, T transmittance) {
   return {weight, transmittance - weight};
 }
 
-// Multiplies sigma by a texel's alpha m and clamps it, see AlphaTiles.
+// Multiplies sigma by a texel's alpha m and clamps it.
 template <class T> BT_HD T alpha_cut(T sigma, T m) { return min_(T(kAlphaMax), sigma * m); }
 
 // The open pixels that take the fragment, and those it ends, as it would leave less transmittance than `stop`. One that

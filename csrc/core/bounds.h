@@ -26,8 +26,8 @@ template <class S> BT_HD S low_pass_radius(S level) { return sqrt_(level) + S(0.
 
 // Returns true where the low pass of a row, of squared radius `wide`, nowhere exceeds the kernel.
 // With x = rho / 9 <= d^2 / k near the centre, k = 9 W^2 / |UV|^2 at its smallest, and log(1 - x) >= -x / (1 - x), the
-// kernel (1 - x)^beta is at least exp(-d^2 / wide) out to d^2 / wide = ln 255 where k >= (beta + ln 255) wide. Up to
-// there the plane must lie beyond `near`, which clips the kernel only.
+// kernel (1 - x)^beta is at least exp(-d^2 / wide) out to d^2 / wide = ln 255 where k >= (beta + ln 255) wide. There
+// the plane must lie beyond `near`, which clips the kernel only.
 template <class T> BT_HD MaskOf<T> covers_low_pass(const T* g, T near, T wide) {
   const T reach = T(kLowPassReach), change = reach * sqrt_(wide) * (abs_(g[kW1]) + abs_(g[kW2]));
   const T least = g[kW0] - change, most = g[kW0] + change, k = T(kSupport2) * least * least;
@@ -96,7 +96,7 @@ template <class T> BT_HD MaskOf<T> out_of_view(const DiscImage<T>& d, T cx, T cy
   return (d.angle > T(1e-6)) & (beyond_border(d.xu, d.xv, d.cu, d.cv, border(cx, width)) |
                                 beyond_border(d.yu, d.yv, d.cu, d.cv, border(cy, height)));
 }
-// Reduces discs without a box, `d`, that are out of view to their low pass.
+// Reduces discs without a box that are out of view to their low pass.
 template <class T> BT_HD void cut_to_view(const DiscImage<T>& d, T cx, T cy, int width, int height, Outline<T>& e) {
   const MaskOf<T> in_view = not_(e.whole & out_of_view(d, cx, cy, width, height));
   e.whole = e.whole & in_view, e.ellipse = e.ellipse & in_view;
@@ -112,7 +112,7 @@ template <class T> BT_HD Interval<T> range_of(const Outline<T>& e, T low, T high
 template <class T> BT_HD Interval<T> columns_of(const Outline<T>& e) { return range_of(e, e.x0, e.x1); }
 template <class T> BT_HD Interval<T> rows_of(const Outline<T>& e) { return range_of(e, e.y0, e.y1); }
 // AccuTile: between the lines y = lo and y = hi an ellipse reaches as far as on the lines (added by the caller), or as
-// its leftmost and rightmost points if they lie between, tested with slack.
+// its leftmost and rightmost points if they lie between.
 template <class T> BT_HD void add_outermost(MaskOf<T> where, const Outline<T>& e, T lo, T hi, T slack, Interval<T>& r) {
   r.add_where(where & (e.y_left >= lo - slack) & (hi + slack >= e.y_left), e.x0, e.x0);
   r.add_where(where & (e.y_right >= lo - slack) & (hi + slack >= e.y_right), e.x1, e.x1);
@@ -229,7 +229,7 @@ template <class T> BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T 
       const T pad = T(2 * kBoundPad) + T(kBoundSlack) * root;
       r.add_where(crossed & (disc >= zero), mid - root - pad, mid + root + pad);
     }
-    // no crossings: the ellipse lies between the lines
+    // no crossings: between the lines
     r.add_where(crossed & r.empty(), e.x0, e.x1);
     add_outermost(crossed, e, lo, hi, T(2 * kBoundPad) + T(kBoundSlack) * (e.y1 - e.y0), r);
     const Interval<T> none;

@@ -1,5 +1,5 @@
-// Residual colour field rho(x): contraction of space, multiresolution hash encoding (Instant NGP, Müller et al. 2022)
-// and a small MLP, eq. (color).
+// Residual colour field rho(x), eq. (color): contraction of space, multiresolution hash encoding (Instant NGP, Müller
+// et al. 2022) and a small MLP.
 #pragma once
 
 #include "core/common.h"
@@ -159,7 +159,7 @@ BT_HD Row mlp_vjp(const Mlp<S, Row>& m, const MlpState<S, Row>& state, Vec3<S> d
   store(h, g.g1);
   return product(m.w1t, h);
 }
-// Adds the weights' gradients to w1, w2 and w3 of `sums`: outer products of a layer's input and its output's gradient.
+// Adds the weights' gradients to w1, w2 and w3 of `sums`.
 template <class S, class Row>
 BT_HD void add_weight_gradient(const S* features, const MlpState<S, Row>& state, const MlpGradient<Row>& g, Vec3<S> d,
                                Mlp<S, Row>& sums) {

@@ -30,7 +30,6 @@ template <class Kernel, class S> BT_HD LevelSet<S> level_set(const S* g, S near,
 
 template <class S> struct PlaneBounds : Outline<S>, DiscImage<S> {};
 
-// Computes box and outermost points from X, Y and C.
 template <class S> BT_HD void bounding_box(PlaneBounds<S>& e) {
   const S cc = e.cu * e.cu + e.cv * e.cv, rest = S(1) - cc;
   const S xx = e.xu * e.xu + e.xv * e.xv, yy = e.yu * e.yu + e.yv * e.yv;
@@ -130,14 +129,14 @@ template <class S> BT_HD Footprint<S> footprint(const S* row, int width, int hei
   return f;
 }
 
-// Returns the columns that it can touch, for a footprint that does not cover everything.
+// Returns the columns that a footprint with a box can touch.
 template <class S> BT_HD Interval<S> columns_of(const Footprint<S>& f) {
   const Interval<S> x = columns_of(f.bounds);
   const S pad = f.bounds.ellipse ? f.pad : S(0);
   return {f.cx + x.x0 - pad, f.cx + x.x1 + pad};
 }
 
-// A row of tiles of a footprint with a box: the pixels that can be touched in each band of four rows, and their tiles.
+// A row of tiles: the pixels that can be touched in each band of four rows, and their tiles.
 struct TileRow {
   int from[kBands], to[kBands];  // pixels, none when from > to
   int left, right;               // tiles, none when left > right

@@ -58,7 +58,7 @@ template <class S, class T> BT_HD Reached<T> reached(const S* g, T x, T y, S hal
   return {within_in_front(nearest, T(r2 * S(1 + 1e-5))), dx * dx + dy * dy < T(blur2)};
 }
 
-// Returns true where the plane lies beyond the near depth; for points in front of the camera.
+// Returns true where the plane lies beyond the near depth, in front of the camera.
 template <class S, class T> BT_HD MaskOf<T> behind_near(const S* g, S near, T W) {
   return T(g[kW0] * g[kZ]) > T(near) * W;
 }
@@ -112,7 +112,7 @@ BT_HD Fragment<T> fragment(const S* g, S near, T dx, T dy, S sharp = S(1)) {
   return f;
 }
 
-// Evaluates without low pass where within_in_front and behind_near are known to hold.
+// Evaluates without low pass where within_in_front and behind_near hold.
 template <class S, class T> BT_HD Fragment<T> fragment_within(const S* g, const Planes<T>& p) {
   const T inv = inverse_(p.W);
   const T rest = T(S(1)) - (p.U * p.U + p.V * p.V) * (inv * inv) * T(S(1.0 / kSupport2));

@@ -1,4 +1,4 @@
-// Cameras, and a projected surfel with everything its fragments need, with the vector-Jacobian product.
+// Cameras, and projected surfels with their vector-Jacobian product.
 //
 // Let a, b be the unit tangents, n = a x b the normal and p the centre, all in the camera frame, and r the ray
 // r = (x, y, 1) of a pixel at (dx, dy) pixels from the projected centre. The ray meets the disc's plane at depth
@@ -85,8 +85,7 @@ template <class F> void with_kernel(float photo_pixel, F&& launch) {
   photo_pixel != 1 ? launch(ResizedKernel()) : launch(LowPassKernel());
 }
 
-// Evaluates a plane without its constant at (dx, dy) pixels from the projected centre: U is slope(g, kU1, ...), W is
-// g[kW0] + slope(g, kW1, ...).
+// Evaluates a plane without its constant: U is slope(g, kU1, ...), W is g[kW0] + slope(g, kW1, ...).
 template <class S, class T> BT_HD T slope(const S* g, GeomColumn first, T dx, T dy) {
   return T(g[first]) * dx + T(g[first + 1]) * dy;
 }
@@ -183,7 +182,7 @@ template <class S> BT_HD void rotation_vjp(const Rotation<S>& r, Vec3<S> du, Vec
   dq[2] = (gy - along * y) * r.inv, dq[3] = (gz - along * z) * r.inv;
 }
 
-// Computes s = exp of the clamped log scale; ds/dlog is s inside the range and 0 outside.
+// Computes s = exp of the clamped log scale; ds/dlog is s, 0 outside of the range.
 template <class T> BT_HD T surfel_scale(T log_scale) {
   return exp_(clamp_(log_scale, T(-kLogScaleMax), T(kLogScaleMax)));
 }

@@ -1,5 +1,5 @@
-// Positions of surfel coordinates in an atlas tile: texel i of r has its centre at u = (i + 0.5) / r * 2 e - e, with e
-// the half side of the surfel's tile in scale units (eq. texel centres).
+// Positions of surfel coordinates in a tile: texel i of r has its centre at u = (i + 0.5) / r * 2 e - e, with e the
+// half side of the tile in scale units (eq. texel centres).
 #pragma once
 
 #include <cstdint>
@@ -20,8 +20,8 @@ template <class S, class T> BT_HD T texel_position_scaled(T u, S span, S k) {
   return clamp_(u * T((span + S(1)) * k) + T(S(0.5) * span), T(S(0)), T(span));
 }
 
-// Mip levels of a tile: a level has means of 2 x 2 texels of the one before. It exists if the tile's position and sides
-// are divisible by 2^level, so that these are also 2 x 2 texels of the page.
+// Mip levels of a tile: means of 2 x 2 texels of the level before. A level exists if the tile's position and sides are
+// divisible by 2^level, so that these are also 2 x 2 texels of the page.
 constexpr int kTileLevels = 3;
 BT_HD bool has_level(const int32_t* tile, int level) {  // x, y, page, r_u, r_v
   return ((tile[0] | tile[1] | tile[3] | tile[4]) & ((1 << level) - 1)) == 0;
@@ -57,8 +57,7 @@ struct TexelSteps {
   BT_HD explicit TexelSteps(const int32_t* size) : right(size[0] > 1 ? 1 : 0), down(size[1] > 1 ? size[0] : 0) {}
 };
 
-// Bilinear fetch from four texels t (three channels or a SIMD vector), two rows along u: its weights, value, and slopes
-// along u and v per texel.
+// Bilinear fetch from four texels t, two rows along u: its weights, value, and slopes along u and v per texel.
 template <class S> BT_HD void texel_weights(S fx, S fy, S* weight) {
   weight[0] = (S(1) - fx) * (S(1) - fy), weight[1] = fx * (S(1) - fy), weight[2] = (S(1) - fx) * fy;
   weight[3] = fx * fy;

@@ -66,7 +66,7 @@ template <class S> BT_HD S ssim_window(S a, S b, S aa, S bb, S ab, S* d) {
   d[2] = two * p * i;
   return value;
 }
-// Computes the gradient of pixel a from the sums over its windows of k d[0], k d[1] and k d[2].
+// Computes the gradient of pixel a from the sums of k d over its windows.
 template <class S> BT_HD S ssim_pixel_gradient(S a, S b, S d0, S d1, S d2) { return d0 + S(2.0f) * a * d1 + b * d2; }
 
 }  // namespace bt

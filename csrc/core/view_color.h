@@ -1,5 +1,4 @@
-// View-dependent colours f_view(d) of all surfels: parameter arrays, and dispatch to the struct of a kind
-// (core/view_kinds.h).
+// View-dependent colours f_view(d) of all surfels: parameter arrays, and dispatch to a kind of core/view_kinds.h.
 #pragma once
 
 #include "core/view_kinds.h"

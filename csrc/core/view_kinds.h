@@ -39,7 +39,7 @@ struct SphericalVoronoi {
   static constexpr int kLeastTerms = 1, kPresetTerms = 7, kReducedWidth = 6;
   BT_HD static ViewColorWidths widths(int K) { return {3 * K, K, 3 * K}; }
 
-  // c = sum_k softmax_k(tau_k s_k . d) rgb_k; softmax by log-sum-exp, so that any temperature is safe.
+  // c = sum_k softmax_k(tau_k s_k . d) rgb_k, by log-sum-exp.
   template <class S> BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
     const S *sites = p.a, *log_tau = p.b, *rgb = p.c;
     S logits[kMaxTerms], top = S(-1e30);
@@ -195,7 +195,7 @@ struct SphericalHarmonics : StoredWhole<SphericalHarmonics, 1> {
   }
 };
 
-// Softplus log(1 + exp(a x)) / a with a = 10 ln 2, so that it is 0.1 at 0 (lobe colours of Deformable Beta Splatting).
+// Softplus log(1 + exp(a x)) / a with a = 10 ln 2, 0.1 at 0 (lobe colours of Deformable Beta Splatting).
 constexpr double kLobeSharpness = 6.931471805599453;
 template <class S> BT_HD S lobe_softplus(S x) {
   const S a = S(kLobeSharpness) * x;

@@ -9,8 +9,8 @@ namespace bt {
 // Half extents of surfels without a box, in pixels, and the upper bound of others.
 constexpr double kBoxless = 1e6;
 
-// A projected surfel, or one per lane: rows of geom and frames, and half extents of the level set's box in pixels.
-// `projected`: finite and in front of the camera; `seen`: and its box meets the image.
+// Rows of geom and frames, and half extents of the level set's box in pixels. `projected`: finite and in front of the
+// camera; `seen`: and its box meets the image.
 template <class T> struct Sight {
   T geom[kGeom], frame[kFrame], radii[2];
   MaskOf<T> projected, seen;

@@ -74,7 +74,7 @@ template <class S, int channels> inline TexelPairs<S, channels> texel_pairs(cons
 }
 
 #if defined(__AVX2__)
-// Interpolates along v between the texels at 16 offsets and those `down` below, and likewise their right neighbours.
+// Interpolates along v between the texels at 16 offsets, or their right neighbours, and those `down` below.
 template <int channels>
 inline TexelPairs<float, channels> pairs_along_v(const float* patch, const int32_t* at, int64_t down, Lanes<float> fy) {
   alignas(64) float below[kLanes];
@@ -207,7 +207,7 @@ template <class S> DrawnSurfel<S> drawn_surfel(const BakedForward<S>& a, int64_t
   return d;
 }
 
-// Fetches a surfel's residuals at surfel coordinates, and alpha with four channels.
+// Fetches residuals at surfel coordinates, and alpha with four channels.
 template <int channels, class S>
 inline Texels<S, channels> texels_at(const DrawnSurfel<S>& d, Lanes<S> u, Lanes<S> v, const BakedResidual& atlas) {
   using P = Lanes<S>;

@@ -56,7 +56,7 @@ void sort_by_depth(std::vector<std::pair<float, int32_t>>& order) {
 
 template <class S> using Order = std::pair<S, int32_t>;  // depth, surfel
 
-// Extents and level sets of surfels in an order, sixteen at a time.
+// Extents and level sets of surfels, sixteen at a time.
 template <class Kernel, class S> class Extents {
  public:
   Extents(const View<S>& view, const Order<S>* order, int64_t begin, int64_t end, float* level)
@@ -125,7 +125,7 @@ template <class Kernel, class S> class Extents {
   Extent found_[kLanes];
 };
 
-// Tile spans of surfels row by row, sixteen rows at a time across surfels.
+// Tile spans of surfels, sixteen rows at a time.
 class TileRows {
  public:
   explicit TileRows(int width) : width_(width) {}
@@ -177,7 +177,7 @@ template <class S, class F> void for_reached_tiles(const S* g, const float* leve
     }
 }
 
-// Bins in phases. Each thread counts and later fills its own run of the order, so lists come out sorted.
+// Each thread counts and later fills its own run of the order, so lists come out sorted.
 template <class Kernel, class S> class KernelBinner final : public Binner<S> {
  public:
   KernelBinner(const View<S>& view, Bins& bins) : view_(view), bins_(bins) {

@@ -1,5 +1,5 @@
-// Shading and blending in one pass over the fragments, and the backward pass, without storing colours or their
-// gradients. Vectorised by block; texels fragment by fragment.
+// Shading and blending in one pass over the fragments, and the backward pass, without storing colours. Vectorised by
+// block; texels fragment by fragment.
 #include "ops/blend.h"
 
 #include <numeric>
@@ -259,8 +259,8 @@ std::vector<int64_t> by_surfel(const ListedRuns& runs, int64_t n) {
   return order;
 }
 
-// Calls fn(k, last) for the runs order[k] to order[last - 1] of every surfel. One thread handles all runs of a surfel
-// in list order, so no other thread adds to its texels.
+// Calls fn(k, last) for the runs order[k] to order[last - 1] of every surfel, in list order and by one thread, so that
+// no other adds to its texels.
 template <class F> void for_surfels(const ListedRuns& runs, const int64_t* order, F&& fn) {
   const int64_t count = runs.count();
   std::vector<int64_t> cost(count + 1, 0);
@@ -301,7 +301,7 @@ BT_HD void prefetch_next(const Backward<S>& a, const BlockPicture<S, channels>& 
 }
 
 // Moves texels by their gradients, rows of four with the last 0. Each store also rewrites a number of the next texel,
-// so several are loaded together: loads of partly stored data would stall.
+// so several are loaded together: loads of partly stored data stall.
 template <class S> void move_texels(const S* rows, int64_t count, S rate, const S* share, S* texels) {
   constexpr int kTogether = 8;
   int64_t t = 0;
@@ -335,7 +335,7 @@ void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kM
     if (moves) move_texels(own.data(), area, a.rate, a.share + patch.first, a.moved + 3 * patch.first);
   });
 }
-// Run by run, faster without texels as it reads sequentially.
+// Run by run: faster without texels.
 template <bool kMaps, class S>
 void backward_by_run(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
                      const std::vector<int64_t>& order) {

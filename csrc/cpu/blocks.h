@@ -109,7 +109,7 @@ template <class F> BT_HD void each_pixel(int64_t tile, int width, int height, F&
     }
 }
 
-// An image [H, W, channels] by tile, block and channel, the 16 pixels of a block contiguous; 0 outside the image.
+// An image by tile, block and channel, the 16 pixels of a block contiguous; 0 outside the image.
 template <class S, int channels> class BlockPicture {
  public:
   BlockPicture(const S* rows, int width, int height)

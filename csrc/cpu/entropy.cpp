@@ -168,7 +168,7 @@ Occurrences count(const IntegerColumn& column, const int64_t* values, int64_t ce
   }
   return found;
 }
-// Counts in all orders. In blocks, the contexts of an order are unions of those of the next.
+// In blocks, the contexts of an order are unions of those of the next.
 std::vector<Occurrences> count_all(const IntegerColumn& column, const int64_t* values, int64_t centre) {
   std::vector<Occurrences> found(column.blocks && !column.others ? 2 : kOrders);
   for (int order = int(found.size()) - 1; order >= 0; --order) {

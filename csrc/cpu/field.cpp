@@ -81,8 +81,8 @@ template <class S> struct Encoder {
   }
 };
 
-// Collects gradients of the table from batches of points and adds them level by level: no level is written by two
-// threads, and every entry sums its points in order.
+// Adds gradients of the table from batches of points level by level: no level is written by two threads, and every
+// entry sums its points in order.
 template <class S> struct TableScatter {
   struct Batch {
     int count = 0;

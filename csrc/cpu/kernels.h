@@ -1,5 +1,5 @@
-// CPU kernels: loops over core/ with threads and SIMD, independent of Python. Arrays are dense and row major. Results
-// do not depend on thread scheduling; the order of summation depends on the number of threads only.
+// CPU kernels: loops over core/ with threads and SIMD, independent of Python. Arrays are dense and row major. The order
+// of summation depends on the number of threads, not on their scheduling.
 #pragma once
 
 #include <cstdint>
@@ -43,8 +43,8 @@ template <class S> class Binner {
  public:
   using Aside = std::function<void(int64_t begin, int64_t end)>;
   virtual ~Binner() = default;
-  // Called by all threads; the lists are complete when it returns. aside(begin, end), if given, is work for all surfels
-  // that the threads do while one of them sorts.
+  // Called by all threads; the lists are complete when it returns. aside(begin, end): work for all surfels that the
+  // threads do while one of them sorts.
   virtual void run(const Member& m, const Aside& aside) = 0;
 };
 template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins);
@@ -53,8 +53,7 @@ template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& 
 template <class S> struct FoundFragments {
   std::vector<int64_t> tile_start, block_start;  // [tiles + 1]
   int64_t total = 0, blocks = 0;
-  // Filled by trace, read by copy. Chunks are large, so that unwritten memory costs nothing and freed memory returns to
-  // the system. A tile's fragments lie in one chunk.
+  // Large, so that unwritten memory costs nothing and freed memory returns to the system. A tile's lie in one.
   struct Chunk {
     static constexpr int64_t kSize = int64_t(1) << 21;
     explicit Chunk(bool first) : memory(allocate(kSize * (2 * sizeof(int32_t) + 5 * sizeof(S)), !first)) {}
@@ -268,7 +267,7 @@ template <class S> void baked_forward(const BakedForward<S>& a);
 constexpr int kCosines = 8;       // texels along a side of the largest block
 constexpr int kMostChannels = 3;  // of a texel
 
-// All blocks of one size, and their transform, whose coefficients are integer multiples of steps.
+// All blocks of one size; coefficients are integer multiples of steps.
 template <class S> struct CosineBlocks {
   int64_t texels, tiles, blocks;
   int height, width, channels;  // of a block, at most kCosines each
@@ -295,8 +294,8 @@ template <class S> struct CosineBlocks {
   }
 };
 
-// Coefficients c of every block and channel that nearly minimise sum of weight (t - t(c))^2 + an L1 penalty: `rounds`
-// iterations of ISTA from the plain transform.
+// Coefficients c that nearly minimise the sum of weight (t - t(c))^2 + an L1 penalty: `rounds` iterations of ISTA from
+// the plain transform.
 template <class S> struct SparseCosines : CosineBlocks<S> {
   int rounds;
   S shrink;          // soft threshold relative to the step, for equal weights

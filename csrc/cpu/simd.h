@@ -58,8 +58,7 @@ BT_HD __m256i mask_of_eight(uint32_t lanes) {
 template <> BT_HD MaskOfFloats mask_of_lanes(uint32_t lanes) { return (MaskOfFloats)mask_of_eight(lanes); }
 BT_HD __m256i first_lanes(uint32_t lanes) { return mask_of_eight((1u << __builtin_popcount(lanes)) - 1u); }
 
-// Permutations per set of eight lanes, a byte per lane: the selected lanes in order, and its inverse, the rank of each
-// lane.
+// Permutations per set of eight lanes, a byte per lane: the selected lanes in order, and the rank of each lane.
 struct LaneOrder {
   std::array<uint64_t, 256> number{}, rank{};
   constexpr LaneOrder() {
@@ -230,8 +229,8 @@ BT_HD Lanes<float> log_(Lanes<float> x) {
   const V n = convert<V>(e);
   return (r + n * 1.42860677e-6f) + n * 0.693145752f;
 }
-// x^y for x in (0, 1] and y >= 0, with a relative error below 1e-6 where the result exceeds 1e-3: as accurate as exp_
-// of y log_(x) in half the operations; at least 2^-126, as denormals are slow. Logarithm and power are to base 2.
+// x^y for x in (0, 1] and y >= 0, to base 2, with a relative error below 1e-6 where the result exceeds 1e-3: as
+// accurate as exp_ of y log_(x) in half the operations; at least 2^-126, as denormals are slow.
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 // 1 / m and -log2 of it, at the middles of 16 parts of [1, 2)
 alignas(64) inline constexpr float kInverse[16] = {

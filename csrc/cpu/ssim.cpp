@@ -53,7 +53,7 @@ template <class S> class Band {
 
   // row_sum [rows]: sums of the windows' values.
   void run(int64_t from, int64_t to, double* row_sum) {
-    // a pixel's gradient needs windows from up to kTaps - 1 rows above, a window needs as many rows below
+    // a pixel's gradient needs windows from kTaps - 1 rows above, a window as many rows below
     const int64_t first = da_ ? std::max<int64_t>(0, from - kTaps + 1) : from, last = std::min<int64_t>(to, rows_);
     for (int64_t y = first; y < std::min<int64_t>(first + kTaps - 1, last + kTaps - 1); ++y) filter_row(y);
     for (int64_t y = first; y < to; ++y) {

@@ -105,8 +105,8 @@ template <class S> class PatchFragments {
     r.fx = load(fx_ + j);
     return r;
   }
-  // Adds the gradients of fragment j's texels to rows of four; g: gradient of its colour. Four at a time, as loads of
-  // eight would wait for the partial stores of the previous fragment.
+  // Adds the gradients of fragment j's texels to rows of four; g: gradient of its colour. Loads of eight would wait for
+  // the partial stores of the previous fragment.
   BT_HD void add_gradient(int j, Four<S> g, S* rows) const {
     const Four<S> below = fy_[j] * g, above = g - below, below_right = fx_[j] * below, right = fx_[j] * above;
     S* at = rows + 4 * int64_t(first_[j]);
@@ -114,8 +114,7 @@ template <class S> class PatchFragments {
     add(above - right, at), add(right, at + across);
     add(below - below_right, at + down), add(below_right, at + down + across);
   }
-  // Computes the coordinates' gradients of a block's fragments from those of their colours, g; 0 beyond the outer texel
-  // centres.
+  // Computes the coordinates' gradients from those of the colours, g; 0 beyond the outer texel centres.
   BT_HD Lanes<S> gradient_u(int j, const BlockTexels<S>& at, const Lanes<S>* g) const {
     const Lanes<S> slope = g[0] * at.slope_u(0) + g[1] * at.slope_u(1) + g[2] * at.slope_u(2);
     return select(mask_of<S>(inside_u_[j / kLanes]), Lanes<S>(per_u_) * slope, Lanes<S>(S(0)));

@@ -29,8 +29,8 @@ void use_one_thread_after_fork();  // registers the above
 // Lets idle threads sleep instead of spin, unless OMP_WAIT_POLICY or GOMP_SPINCOUNT are set; once per process.
 void wait_without_spinning();
 
-// Calls fn(thread, size) on `size` threads at once, at most `most`. No exception may leave a parallel region: the first
-// one is thrown again behind it.
+// Calls fn(thread, size) on `size` threads at once, at most `most`. The first exception is thrown again behind the
+// parallel region, which none may leave.
 template <class F> void on_threads(int most, F&& fn) {
 #if defined(_OPENMP)
   if (most > 1) {
@@ -163,7 +163,7 @@ using Memory = std::unique_ptr<unsigned char, FreeMemory>;
 
 constexpr size_t kLargePage = size_t(1) << 21;
 
-// Requests large pages (2 MB, if the system has them) for this range: first writes then take a sixth of the time.
+// Requests large pages for this range: first writes then take a sixth of the time.
 inline void use_large_pages(void* at, size_t bytes) {
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
   const uintptr_t from = (reinterpret_cast<uintptr_t>(at) + kLargePage - 1) / kLargePage * kLargePage;

@@ -22,8 +22,7 @@ template <class S> uint32_t marks(Lanes<S> v) {
   return bits(Lanes<S>(convert<V>(same_bits<I>(v.v) & 1)) > Lanes<S>(S(0.5)));
 }
 
-// Prefetches the tile entry of a surfel a few steps ahead, the texels of the next surfel, and their gradients
-// `of_texels`, unless null.
+// Prefetches the tile entry of a surfel a few steps ahead, the texels of the next surfel, and their gradients.
 template <class S> BT_HD void prefetch_tile(const AlphaTiles<S>& tiles, int64_t id) {
   __builtin_prefetch(tiles.first + id), __builtin_prefetch(tiles.size + 2 * id), __builtin_prefetch(tiles.extent + id);
 }
@@ -210,7 +209,7 @@ template <class S> struct TileState {
 };
 
 // Visits the surfels that a tile may show, front to back, while a pixel is open: fn(surfel, blend), where blend(take)
-// blends the surfel with its alpha texels; `take` as in TileState::blend.
+// blends the surfel with its alpha texels as TileState::blend.
 template <bool kAll, class S, class F>
 void each_surfel(const View<S>& view, const AlphaTiles<S>& alpha, const Bins& bins, int64_t tile, F&& fn) {
   using P = Lanes<S>;

@@ -1,4 +1,4 @@
-// Fit of Spherical Voronoi colours by Levenberg-Marquardt, and ranking of their sites: a lane for every surfel.
+// Fit of Spherical Voronoi colours and ranking of their sites, a lane for every surfel.
 #include "cpu/kernels.h"
 #include "cpu/simd.h"
 

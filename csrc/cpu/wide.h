@@ -1,5 +1,5 @@
-// Vectors of 16 lanes, composed of native vectors, with the same operators. The compiler splits vectors wider than a
-// register lane by lane in comparisons and selections.
+// Vectors of 16 lanes, composed of native vectors: the compiler splits vectors wider than a register lane by lane in
+// comparisons and selections.
 #pragma once
 
 #include <cstdint>

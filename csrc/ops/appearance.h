@@ -51,8 +51,8 @@ template <class S> struct ViewColorBackward {
 };
 
 // Adam step number `step`, from 1, on row `number` of the photographs' corrections, table [photographs, width], by the
-// gradient [width] with respect to the correction (gains, not log gains). Unless settle is 0, all rows are then
-// projected to admissible ones, as by `train.exposure.settled`.
+// gradient [width] with respect to the correction (gains, not log gains). Unless settle is 0, all rows are then made
+// admissible, as by `train.exposure.settled`.
 template <class S> struct LearnExposure {
   int64_t photographs, number;
   int width, settle;

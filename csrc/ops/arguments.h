@@ -1,5 +1,5 @@
-// Each operation has one struct of arguments, shared by its CPU and CUDA kernels. The struct's `fields` names each
-// argument once, with its size, to a reader that fills it (bindings/reader.h), independently of Python.
+// Each operation has one struct of arguments for its CPU and CUDA kernels. Its `fields` names each argument with its
+// size to a reader that fills it (bindings/reader.h), independently of Python.
 //
 //   r.array(name, pointer, count)      `count` numbers; input where the pointer is to const
 //   r.wide(name, pointer, count)       likewise; CUDA kernels read it 16 bytes at a time
@@ -62,7 +62,7 @@ template <class R> void take(R& r, const char* name, TileStarts& to) {
 }
 
 // Index of a fragment list on the CPU: within a tile and surfel, fragments are ordered by blocks of 4 x 4 pixels
-// (cpu/blocks.h). Made by trace only: blocks and fragments are not checked against each other. CUDA has `Pairs`.
+// (cpu/blocks.h). Blocks and fragments, made by trace, are not checked against each other. CUDA has `Pairs`.
 struct TileBlocks {
   const int64_t* start;        // [tiles + 1] first fragment of each tile
   const int64_t* block_start;  // [tiles + 1] first block of each tile

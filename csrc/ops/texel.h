@@ -1,5 +1,4 @@
-// Arguments of texels, and the working memory of their gradients; alpha texels, the alpha of a fragment, and its
-// vector-Jacobian product.
+// Arguments of texels and alpha texels; the alpha of a fragment, and its vector-Jacobian product.
 #pragma once
 
 #include "core/blend.h"
@@ -91,13 +90,13 @@ void check_tiles(R& r, const TexelTiles<S>& table, const AlphaTiles<S>& alpha, i
     r.refuse("the tiles belong to other surfels or other alphas");
 }
 
-// Computes the gradients of a fragment's alpha factor: replaces gs, the gradient of the listed sigma, and the listed
-// sigma by those of the kernel's, adds to gu and gv, and returns the gradient of m. t: the four texels.
+// Computes the gradient of m and returns it; replaces gs, the gradient of the listed sigma, and that sigma by those of
+// the kernel's, and adds to gu and gv. t: the four texels.
 template <class S, class T>
 BT_HD T alpha_vjp(const AlphaPatch<S>& patch, const T (&t)[4], const TexelAxis<T>& x, const TexelAxis<T>& y, T& listed,
                   T& gs, T& gu, T& gv) {
   const T m = texel_lerp(t, x.fraction, y.fraction), sigma = abs_(listed), zero = T(S(0));
-  // clamped values pass no gradient; m may round differently than when the fragment was written
+  // m may round differently than when the fragment was written
   const MaskOf<T> moves = sigma < T(S(kAlphaMax)), uncut_moves = moves & (sigma < m * T(S(kAlphaMax * (1 - 1e-6))));
   const T dm = select(moves, gs * sigma / m, zero);
   gu += select(x.inside, dm * T(texel_density(patch.size[0], patch.extent)) * texel_slope_u(t, y.fraction), zero);

@@ -21,7 +21,6 @@ template <class S> BT_HD S level_radius2(S level, S beta, S slack) {
   const S x = S(1) - exp_(-level / max_(beta, S(1e-6)));
   return S(kSupport2) * min_(S(1), x * S(1.0002) + slack);
 }
-// Computes the radius in pixels where the low pass is exp(-level).
 template <class S> BT_HD S low_pass_radius(S level) { return sqrt_(level) + S(0.01); }
 
 // Returns true where the low pass of a row, of squared radius `wide`, nowhere exceeds the kernel.
@@ -249,7 +248,6 @@ template <class T> BT_HD Interval<T> row_interval(const ExtentOf<T>& e, T lo, T 
 constexpr int kTile = 16;  // pixels along a side
 BT_HD int tiles_across(int pixels) { return (pixels + kTile - 1) / kTile; }
 
-// Integer interval, empty when first > last.
 template <class T> struct TileSpan {
   T first, last;
 };

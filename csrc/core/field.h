@@ -10,7 +10,6 @@ constexpr int kFeatures = 4;  // per level
 constexpr int kWidth = 16;    // of both hidden layers
 constexpr int kMaxLevels = 4;
 
-// Parameters of the field.
 template <class S> struct FieldArrays {
   int levels, log2_size, min_resolution;
   bool contract;
@@ -127,7 +126,6 @@ template <class S, class Row> struct Mlp {
 template <class S, class Row> struct MlpState {
   Row h1, h2;
 };
-// Gradients at the inputs of the two ReLUs.
 template <class Row> struct MlpGradient {
   Row g1, g2;
 };

@@ -32,7 +32,6 @@ template <class S, class T> BT_HD Planes<T> planes(const S* g, T dx, T dy) {
 // Tests u^2 + v^2 < r2 without a division, on either side of the camera.
 template <class T> BT_HD MaskOf<T> within(const Planes<T>& p, T r2) { return p.U * p.U + p.V * p.V < r2 * p.W * p.W; }
 
-// Tests the same, and in front of the camera.
 template <class T> BT_HD MaskOf<T> within_in_front(const Planes<T>& p, T r2) {
   return p.U * p.U + p.V * p.V < r2 * p.W * abs_(p.W);
 }

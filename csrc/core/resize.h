@@ -14,7 +14,6 @@
 
 namespace bt {
 
-// Resampling parameters of a view.
 template <class S> struct Resize {
   S variance;  // c, pixels^2
   S sharp;     // 1 / squared radius of the low pass

@@ -19,7 +19,6 @@ template <class S> struct Pinhole {
   S R[9], t[3];  // row major
   S fx, fy, cx, cy;
 };
-// From viewmat [4, 4] and K [3, 3], row major.
 template <class S> BT_HD Pinhole<S> pinhole(const S* viewmat, const S* K) {
   Pinhole<S> c;
   for (int i = 0; i < 3; ++i) {
@@ -93,7 +92,6 @@ template <class S, class T> BT_HD T slope(const S* g, GeomColumn first, T dx, T 
 // Parameters of a surfel's geometry and their numbers, as `ops.parameters.GEOMETRY_PARAMETERS` in Python.
 #define BT_GEOMETRY(each) each(means, 3) each(quats, 4) each(log_scales, 2) each(opacity_logits, 1) each(beta_raw, 1)
 
-// Geometry of n surfels.
 template <class S> struct Surfels {
   int64_t n;
 #define BT_EACH(name, count) const S* name;
@@ -200,7 +198,6 @@ template <class S, class T> BT_HD WorldSurfel<T> world_surfel(const Pinhole<S>& 
   return {rotation(in.quats), surfel_scale(in.log_scales[0]), surfel_scale(in.log_scales[1]),
           to_camera(cam, load3(in.means))};
 }
-// A surfel in the camera frame.
 template <class S, class T> struct CameraSurfel {
   Vec3<T> a, b, n;
   T np, sign, iz, isu, isv;

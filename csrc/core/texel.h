@@ -76,7 +76,6 @@ template <class V, class S> BT_HD V texel_slope_u(const V* t, S fy) {
 template <class V, class S> BT_HD V texel_slope_v(const V* t, S fx) {
   return (S(1) - fx) * (t[2] - t[0]) + fx * (t[3] - t[1]);
 }
-// Returns the texels per unit of u.
 template <class S> BT_HD S texel_density(int r, S extent) { return S(r) / (S(2) * extent); }
 
 // Texels of one fetch, as offsets from the tile's first.
@@ -126,7 +125,6 @@ template <class S, int C> struct TilePatch {
   BT_HD TexelCorners<S> corners(S u, S v) const { return texel_corners(u, v, size, extent); }
 };
 
-// Loads these texels.
 template <class S> BT_HD void load_corners(const S* tile, const TexelCorners<S>& c, Vec3<S>* t) {
   for (int k = 0; k < 4; ++k) t[k] = load3(tile + 3 * c.at[k]);
 }

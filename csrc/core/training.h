@@ -48,7 +48,6 @@ template <class S> struct SsimWindow {
   }
 };
 
-// Adds a pixel of weight k to a window's means of a, b, a^2, b^2 and a b.
 template <class S> BT_HD void add_moments(S k, S a, S b, S* means) {
   const S ka = k * a, kb = k * b;
   means[0] += ka, means[1] += kb, means[2] += ka * a, means[3] += kb * b, means[4] += ka * b;

@@ -50,7 +50,6 @@ template <class S> struct ViewColorArrays {
     r.array(name_b, b, w.b * n);
     if (w.c) r.array(name_c, c, w.c * n);
   }
-  // Returns the row of surfel i.
   BT_HD ViewColorRow<S> row(ViewColorWidths w, int64_t i) const { return {a + w.a * i, b + w.b * i, c + w.c * i}; }
 };
 // Evaluates the colour of surfel i. K is p.terms; kernels that know it at compile time unroll their loops.

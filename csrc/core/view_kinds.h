@@ -24,7 +24,6 @@ template <class S> BT_HD S temperature(S log_tau) { return exp_(min_(log_tau, S(
 struct ViewColorWidths {
   int64_t a, b, c;
 };
-// Parameters of one surfel.
 template <class S> struct ViewColorRow {
   S *a, *b, *c;
 };
@@ -138,7 +137,6 @@ template <class S> BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
     out[14] = f * z * (xx - yy), out[15] = -a * x * (xx - S(3) * yy);
   }
 }
-// Computes sum_k g_k d basis_k / d direction.
 template <class S> BT_HD Vec3<S> sh_basis_vjp(int terms, Vec3<S> d, const S* g) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z, two = S(2), six = S(6);
   Vec3<S> r = {S(0), S(0), S(0)};

@@ -224,7 +224,6 @@ inline Texels<S, channels> texels_at(const DrawnSurfel<S>& d, Lanes<S> u, Lanes<
   return t;
 }
 
-// Prefetches a surfel's first texels.
 template <class S> void prefetch_texels(const DrawnSurfel<S>& d) {
   if (!d.level || d.level->bytes.empty()) return;
   const uint8_t* p = d.level->bytes.data() + d.first;

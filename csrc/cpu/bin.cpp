@@ -31,7 +31,6 @@ template <class Kernel, class S> BT_HD ReachLevels reach_levels(const S* geom, S
   return {float(l.r2), blur * blur};
 }
 
-// Sorts by depth, stably.
 template <class S> void sort_by_depth(std::vector<std::pair<S, int32_t>>& order) {
   std::sort(order.begin(), order.end());
 }
@@ -140,7 +139,6 @@ class TileRows {
       if (++count_ == kLanes) finish(put);
     }
   }
-  // Puts the remaining rows.
   template <class Put> void finish(Put&& put) {
     extents_.whole = mask_of<double>(whole_), extents_.ellipse = mask_of<double>(ellipse_);
     extents_.thin = mask_of<double>(thin_);

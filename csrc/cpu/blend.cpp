@@ -12,7 +12,6 @@
 namespace bt {
 
 namespace {
-// Arguments with the CPU layout.
 template <class S> using Blended = BlendedSurfels<S, TileBlocks>;
 template <class S> using Forward = BlendForward<S, TileBlocks>;
 template <class S> using Backward = BlendBackward<S, TileBlocks>;
@@ -27,13 +26,11 @@ template <class S> class SurfelRun {
   const TexelPatch<S> patch;
   const P beta, normal[3];
 
-  // `prefetch`: prefetch its texels.
   SurfelRun(const Blended<S>& of, const BlockRun& run, bool prefetch)
       : SurfelRun(of, run, prefetch, of.geom + int64_t(run.surfel) * kGeom) {}
   SurfelRun(const SurfelRun&) = delete;
 
   const PatchFragments<S>& few() const { return few_; }
-  // Returns the lanes of block k's fragments with texels.
   BT_HD uint32_t textured(int64_t k) const { return patch.textured() ? textured_[k - run.first] : 0; }
   bool any_textured() const { return any_textured_; }
   // Returns the index of block k's first fragment among `few`.
@@ -185,7 +182,6 @@ void run_backward(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>&
   });
 }
 
-// Sums the lanes.
 template <bool kMaps, class S> Sums<S> total(const Sums<Lanes<S>>& of) {
   Sums<S> all;
   for (int k = 0; k < 3; ++k) {
@@ -199,7 +195,6 @@ template <class S> void add(const Sums<S>& one, Sums<S>& to) {
   for (int k = 0; k < 3; ++k) to.view[k] += one.view[k], to.normal[k] += one.normal[k];
   to.beta += one.beta;
 }
-// Writes the gradients of a surfel.
 template <class S> void surfel_backward(const Backward<S>& a, int64_t id, const Sums<S>& sums) {
   store3(a.dbase + 3 * id, base_gradient(load3(a.of.table.base + 3 * id), load3(sums.view)));
   S* dgeom = a.dgeom + id * kGeom;

@@ -23,7 +23,6 @@ template <class S> struct BlockCentres {
     for (int i = 0; i < kLanes; ++i) x.set(i, pixel_centre<S>(lane_column(i))), y.set(i, pixel_centre<S>(lane_row(i)));
   }
 };
-// First pixels of the blocks as reals, converted once.
 template <class S> struct BlockOffsets {
   S column[kBlocks] = {}, row[kBlocks] = {};
   constexpr BlockOffsets() {
@@ -70,7 +69,6 @@ template <class F> BT_HD void each_run(const TileBlocks& of, int64_t tile, F&& f
     fn(run);
   }
 }
-// Calls fn(run) for the surfels of a tile, back to front.
 template <class F> BT_HD void each_run_back(const TileBlocks& of, int64_t tile, F&& fn) {
   const int64_t first = of.block_start[tile];
   BlockRun run = {int32_t(tile), 0, of.start[tile + 1], 0, of.block_start[tile + 1], 0};

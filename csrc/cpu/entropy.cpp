@@ -45,7 +45,6 @@ Token split(int64_t x, int direct) {
   return {int(2 * kind) - (x < 0), count, magnitude & mask};
 }
 
-// Returns the number of bits that follow a token.
 int bits_after(int token, int direct) {
   const int kind = (token + 1) / 2, above = kind - (1 << direct);
   return above < 0 ? 0 : (above >> kFine) + direct - kFine;

@@ -11,7 +11,6 @@ namespace {
 constexpr int64_t kChunk = 1 << 15;  // points between additions of table gradients
 constexpr int kBatch = 16;           // points per batch of table lookups
 
-// Loads the weights into lanes, with their transposes for the backward pass.
 template <class S> Mlp<S, Lanes<S>> load_mlp(const FieldArrays<S>& field) {
   Mlp<S, Lanes<S>> m;
   const int inputs = field.levels * kFeatures;

@@ -38,7 +38,6 @@ struct Bins {
   std::vector<int32_t> surfels;  // [start.back()]
   std::vector<float> level;      // [n, 2], of visible surfels
 };
-// Fills the bins with the threads of a team.
 template <class S> class Binner {
  public:
   using Aside = std::function<void(int64_t begin, int64_t end)>;

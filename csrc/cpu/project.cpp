@@ -45,7 +45,6 @@ template <int columns> void store_rows(const P* from, uint32_t seen, int n, floa
     for (int k = 0; k < columns; ++k) to[lane * columns + k] = seen >> lane & 1 ? all[k][lane] : 0.0f;
 }
 
-// Returns the number of non-finite surfels.
 template <class Kernel>
 int64_t project_lanes(const Pinhole<float>& cam, const ProjectForward<float>& a, const Resize<float>& to, int64_t begin,
                       int64_t end) {

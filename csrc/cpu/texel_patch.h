@@ -88,7 +88,6 @@ template <class S> class PatchFragments {
     store(fx_ + j, x.fraction), store(fy_ + j, y.fraction);
     inside_u_[j / kLanes] = bits(x.inside), inside_v_[j / kLanes] = bits(y.inside);
   }
-  // Prefetches the texels of fragment j.
   BT_HD void prefetch(int j) const {
     const S* t = of_.tile + 3 * int64_t(first_[j]);
     __builtin_prefetch(t), __builtin_prefetch(t + 3 * next_.down);

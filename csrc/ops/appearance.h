@@ -70,7 +70,6 @@ template <class S> struct LearnExposure {
     r.numbers("limit", limit, "other_limit", other_limit);
   }
   BT_HD S limit_of(int column) const { return is_log_gain(width, column) ? limit : other_limit; }
-  // Updates one entry of the row.
   BT_HD void move(int column) const {
     const int64_t at = number * width + column;
     const S value = gradient[column], chained = is_log_gain(width, column) ? value * S(exp(table[at])) : value;

@@ -81,14 +81,12 @@ struct TileBlocks {
     if (block_start[0] != 0 || block_start[tiles] != count) r.refuse("the blocks do not belong to these tiles");
   }
 };
-// Reads a layout that is a Python object.
 template <class R, class Layout> void take(R& r, const char* name, Layout& to) {
   const Layout* layout = nullptr;
   r.object(name, layout);
   to = *layout;
 }
 
-// A fragment list with its index.
 template <class S, class Layout> struct Fragments {
   Layout layout;
   FragmentArrays<S> f;

@@ -8,7 +8,6 @@
 
 namespace bt {
 
-// Texels of all tiles.
 template <class S> struct TexelTiles : Tiles<S> {
   int64_t n, texels;
   const S* base;    // [n, 3] f_view
@@ -25,7 +24,6 @@ template <class S> struct TexelTiles : Tiles<S> {
     r.rows("texels", values, texels, 3);
   }
 };
-// Texels of one surfel.
 template <class S> struct TexelPatch : TilePatch<S, 3> {
   Vec3<S> view;  // the colour without residual
 
@@ -73,7 +71,6 @@ template <class S> struct AlphaTiles : Tiles<S> {
   }
 };
 
-// Alpha texels of one surfel.
 template <class S> struct AlphaPatch : TilePatch<S, 1> {
   BT_HD AlphaPatch(const AlphaTiles<S>& tiles, int64_t id) : TilePatch<S, 1>(tiles, tiles.values, id) {}
   // Fetches m, exactly 1 between texels of 1, and the four texels.

@@ -48,7 +48,6 @@ template <class S> struct ProjectBackward {
   }
 };
 
-// Rows of a projection.
 template <class S> struct View {
   int64_t n;
   const S *geom, *radii;

@@ -136,7 +136,7 @@ export class App implements Stage {
     this.changed();
   }
 
-  // Makes the surface at a screen pixel the middle of the view, around which it turns.
+  // Makes the surface at a screen pixel the orbit centre.
   private async turnAround(clientX: number, clientY: number): Promise<void> {
     const target = this.picker.waits ? null : await this.picker.surface(clientX, clientY);
     if (!target) return;
@@ -191,7 +191,7 @@ export class App implements Stage {
     };
   }
 
-  // Colour correction of the photograph whose pose the camera has; none on a path, which may pass through such poses.
+  // Of the photograph whose pose the camera has; none on a path, which may pass through such poses.
   private get correction(): number[] | null {
     const shows = this.show === 'color' && pressed(element('exposure')) && !this.path.plays;
     return shows ? correctionAt(this.cameras, this.controls.pose) : null;
@@ -215,7 +215,7 @@ export class App implements Stage {
     else this.go(flight.to);
   }
 
-  // Returns the canvas size in screen pixels, limited by the device.
+  // Limited by the device.
   pixels(): [number, number] {
     const { clientWidth, clientHeight } = this.canvas;
     const most = this.renderer.largestSide / Math.max(clientWidth, clientHeight, 1);
@@ -328,7 +328,6 @@ export class App implements Stage {
     this.changed();
   }
 
-  // Index of the camera in the list.
   private get chosen(): number {
     return Number(element<HTMLSelectElement>('camera').value);
   }

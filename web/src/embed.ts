@@ -35,13 +35,12 @@ export class Embed {
     });
   }
 
-  // Called when the bundle is shown.
   ready(viewer: Embedded, title: string): void {
     this.viewer = viewer;
     this.send('ready', { title, camera: cameraOf(viewer.shared()) });
   }
 
-  // Called after each frame: reports the camera if it has moved.
+  // Reports the camera after a frame, if it has moved.
   shown(): void {
     if (!this.parent || !this.viewer) return;
     const camera = cameraOf(this.viewer.shared());

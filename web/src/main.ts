@@ -30,7 +30,7 @@ async function source(): Promise<Source> {
   return SingleFile.open(file, showProgress);
 }
 
-// Reads the scene's name, and whether it has notes, from view.json, written by the server or an export.
+// Reads view.json, written by the server or an export.
 async function about(): Promise<{ title: string; notes: boolean }> {
   const file = new URLSearchParams(location.search).get('file');
   if (file) return { title: file.replace(/\.bitymi$/, ''), notes: false };
@@ -42,7 +42,7 @@ async function about(): Promise<{ title: string; notes: boolean }> {
   }
 }
 
-// Loads the notes; an invalid notes.json is ignored.
+// An invalid notes.json is ignored.
 async function notesOf(from: Source, stated: boolean): Promise<Notes> {
   try {
     const text = await from.notes(stated);

@@ -19,7 +19,7 @@ const NAME = /^[A-Za-z0-9][A-Za-z0-9._-]{0,99}$/;
 
 const damaged = (what: string): DamagedBundle => new DamagedBundle(`The file is no bundle in one file: ${what}.`);
 
-// Locates the directory of a file of `total` bytes from its last bytes.
+// Locates the directory of a file of `total` bytes.
 export function placeOf(tail: Uint8Array<ArrayBuffer>, total: number): { begin: number; end: number } {
   const view = new DataView(tail.buffer, tail.byteOffset, tail.length);
   const at = tail.length - END.bytes;
@@ -32,7 +32,7 @@ export function placeOf(tail: Uint8Array<ArrayBuffer>, total: number): { begin: 
   return { begin, end };
 }
 
-// Reads the parts by name from the directory, which begins at byte `place` of the file.
+// Reads the directory, which begins at byte `place` of the file.
 export function entriesOf(directory: Uint8Array<ArrayBuffer>, place: number): Map<string, Entry> {
   const view = new DataView(directory.buffer, directory.byteOffset, directory.length);
   const entries = new Map<string, Entry>();

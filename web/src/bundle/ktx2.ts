@@ -21,7 +21,7 @@ const MOST_COLOR = 0x5c00; // 256 as fp16: RESIDUAL_LIMIT of codec/limits.py
 const MOST_ALPHA = 0x4000; // 2
 const MINUS_ZERO = 0x8000;
 
-// Returns the index of the first texel that exceeds the limits or is NaN, else -1.
+// Returns the index of the first number that exceeds the limits or is NaN, else -1.
 function firstBeyond(texels: Uint8Array, alpha: boolean): number {
   const even = texels.byteOffset % 2 ? texels.slice() : texels;
   const halves = new Uint16Array(even.buffer, even.byteOffset, even.byteLength / 2);

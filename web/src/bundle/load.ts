@@ -1,4 +1,4 @@
-// Fetches a bundle's files with progress, checking sizes and hashes.
+// Fetches a bundle's files with progress.
 import { DamagedBundle } from '../errors';
 import { type Pages, parseKtx2 } from './ktx2';
 import { type Atlas, type Manifest, parseManifest } from './manifest';
@@ -11,8 +11,7 @@ export interface Bundle {
   pages: Pages | null;
   later: (() => Promise<Pages>) | null; // fetches the texels, if a first frame can be drawn without them
   cameras: string | null; // cameras.json
-  // Returns a photograph's address for an image element.
-  photograph(name: string): Promise<string>;
+  photograph(name: string): Promise<string>; // its address for an image element
 }
 
 export const MOST_BESIDE = 1 << 26; // bytes of any file but surfels and texels
@@ -36,7 +35,7 @@ export async function readPart(source: Source, info: Manifest, name: string, cam
   return data;
 }
 
-// Loads a bundle; `admit` rejects scenes that are too large, before anything is decoded; `say` shows a line.
+// `admit` rejects scenes that are too large, before anything is decoded; `say` shows a line.
 export async function loadBundle(
   source: Source,
   info: Manifest,

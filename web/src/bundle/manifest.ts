@@ -94,7 +94,7 @@ function columns(r: Reader): Column[] {
   }));
 }
 
-// Reads the description of surfels.bin; the frame is that of the positions.
+// Describes surfels.bin; the frame is that of the positions.
 function compact(r: Reader) {
   const frame = r.part('frame');
   const [center, scale, low] = [frame.point('center'), frame.number('scale'), frame.point('low')];
@@ -102,7 +102,7 @@ function compact(r: Reader) {
 }
 export type CompactSurfels = ReturnType<typeof compact>;
 
-// Reads the description of texels.bin.
+// Describes texels.bin.
 function texels(r: Reader, surfelBytes: number) {
   return {
     texels: r.whole('texels'),
@@ -131,7 +131,7 @@ function atlas(r: Reader, isCompact: boolean, surfelBytes: number) {
 }
 export type Atlas = ReturnType<typeof atlas>;
 
-// Reads points of the scene, with the pixels per unit of length of their photographs.
+// Points of the scene, with the pixels per unit of length of their photographs.
 function points(r: Reader): Float32Array {
   const text = r.text('photographed', /^[A-Za-z0-9+/]*={0,2}$/);
   const refuse = (): never => {

@@ -44,7 +44,6 @@ export function parsePly(data: ArrayBuffer): Map<string, Element> {
   return elements;
 }
 
-// Reads columns of an element; throws if one is missing.
 export class Table {
   readonly count: number;
   private readonly view: DataView;

@@ -11,7 +11,7 @@ const HEADER = 30;
 const letters = (view: DataView, at: number): string =>
   String.fromCharCode(...[0, 1, 2, 3].map((k) => view.getUint8(at + k)));
 
-// Returns true for a lossy WebP picture of a poster's size, the only kind handed to the browser.
+// Lossy WebP pictures of a poster's size alone are handed to the browser.
 export function isPoster(data: ArrayBuffer): boolean {
   const view = new DataView(data);
   if (data.byteLength < HEADER) return false;

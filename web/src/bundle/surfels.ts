@@ -1,4 +1,4 @@
-// Surfels in the shaders' form: struct Surfel of scene.wgsl, and the terms of the view colours.
+// Surfels as struct Surfel of scene.wgsl, and the terms of the view colours.
 import { DamagedBundle } from '../errors';
 import type { Manifest, Vec3, ViewKind } from './manifest';
 import { Table, parsePly } from './ply';
@@ -51,7 +51,7 @@ export function setTile(
   numbers[WORD.layer] = layer;
 }
 
-// Sets each surfel's span in the list of terms of `width` numbers; returns the number of terms.
+// Sets each surfel's span in the list of terms; returns the number of terms.
 export function setTerms(words: Float32Array, counts: ArrayLike<number>, width: number): number {
   const numbers = new Uint32Array(words.buffer);
   let first = 0;

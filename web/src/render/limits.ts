@@ -33,7 +33,6 @@ export function pageBytes({ count, terms, viewColor, compact, atlas, files }: Ma
   return words + ['surfels.ply', 'atlas.ktx2'].reduce((sum, name) => sum + (files.get(name)?.bytes ?? 0), 0);
 }
 
-// Rejects a scene that exceeds the device's limits, by its bundle.json.
 export function checkRoom(info: Manifest, limits: Limits, gigabytes = UNKNOWN_MEMORY): void {
   const { count, terms, viewColor, atlas } = info;
   const largest = Math.max(4 * SURFEL_WORDS * count, 4 * REDUCED_WIDTH[viewColor] * (terms ?? 0));

@@ -1,4 +1,4 @@
-// Shader programs, assembled and compiled; bitymi_ns/ops/webgpu/programs.py does the same in Python.
+// Shader programs, as in bitymi_ns/ops/webgpu/programs.py.
 import batches from '../../../bitymi_ns/ops/shaders/batches.wgsl?raw';
 import bounds from '../../../bitymi_ns/ops/shaders/bounds.wgsl?raw';
 import draw from '../../../bitymi_ns/ops/shaders/draw.wgsl?raw';
@@ -88,7 +88,7 @@ export class Programs {
     });
   }
 
-  // Pipeline that halves a page; `alpha`: colours weighted by alpha.
+  // `alpha`: colours weighted by alpha.
   halve(format: GPUTextureFormat, alpha: boolean): GPURenderPipeline {
     const entryPoint = `halve${alpha ? '_alpha' : ''}_${format === 'rgba8unorm' ? 'bytes' : 'floats'}`;
     return this.once(entryPoint, {

@@ -1,4 +1,4 @@
-// Draws frames of a scene to a target of sums, and from there to a screen.
+// Draws a scene to a target of sums, and from there to a screen.
 import type { Vec3 } from '../bundle/manifest';
 import { FRAME, FRAME_BYTES } from '../bundle/tables';
 import type { View } from '../view/pose';
@@ -68,7 +68,6 @@ export class Renderer {
     return !this.graphics.floats;
   }
 
-  // Largest side of a picture, pixels.
   get largestSide(): number {
     return this.graphics.device.limits.maxTextureDimension2D;
   }
@@ -179,7 +178,7 @@ export class Renderer {
     work.end();
   }
 
-  // Draws a view for a screen, at `scale` of its resolution; resolves when done.
+  // Draws at `scale` of the screen's resolution; resolves when done.
   draw(view: View, to: GPUTexture, scale: number, options: DrawOptions): Promise<undefined> {
     const { queue } = this.graphics.device;
     const encoder = this.graphics.device.createCommandEncoder();
@@ -208,7 +207,6 @@ export class Renderer {
     return { width, height, depth };
   }
 
-  // Draws a view to RGBA bytes.
   async read(view: View, options: DrawOptions): Promise<ImageData> {
     const { device } = this.graphics;
     const size: [number, number] = [view.width, view.height];

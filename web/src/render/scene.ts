@@ -197,7 +197,7 @@ export class SceneOnDevice {
     return texture;
   }
 
-  // Encodes projection, sorting, and division into batches.
+  // Projection, sorting, and division into batches.
   encodeSorting(encoder: GPUCommandEncoder): void {
     const work = encoder.beginComputePass();
     const run = (pipeline: GPUComputePipeline, bound: GPUBindGroup, groups: number): void => {

@@ -6,7 +6,7 @@ import type { DrawOptions, Renderer } from './renderer';
 const FRAME_MILLISECONDS = 1000 / 60;
 const LEAST_SCALE = 0.2;
 
-// Draws a view to the canvas, at `scale` of its resolution; resolves when done.
+// Draws at `scale` of the canvas's resolution; resolves when done.
 export type Screen = (view: View, scale: number, options: DrawOptions) => Promise<unknown>;
 
 function direct(canvas: HTMLCanvasElement, renderer: Renderer, device: GPUDevice): Screen {

@@ -60,7 +60,6 @@ export class CropPanel {
     if (crops(this.all)) this.apply();
   }
 
-  // Draws the box that is being changed.
   drawn(view: View): void {
     const box = element('crop-panel').hidden ? null : this.box;
     this.lines.draw(view, box ? edgesOf(box) : []);
@@ -112,7 +111,7 @@ export class CropPanel {
     this.show();
   }
 
-  // Calls `run` for each click on a surface, until something else is chosen.
+  // Waits for clicks on surfaces, until something else is chosen.
   private wait(run: (point: Vec3) => void): void {
     this.picker.start(`crop-${this.mode}`, (point) => {
       run(point);

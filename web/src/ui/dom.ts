@@ -8,13 +8,12 @@ export function element<T extends HTMLElement = HTMLElement>(id: string): T {
 export const press = (button: HTMLElement, on: boolean): void => button.setAttribute('aria-pressed', String(on));
 export const pressed = (button: HTMLElement): boolean => button.getAttribute('aria-pressed') === 'true';
 
-// Presses or releases a button; returns whether it is pressed then.
+// Returns whether the button is pressed then.
 export function toggle(id: string): boolean {
   press(element(id), !pressed(element(id)));
   return pressed(element(id));
 }
 
-// Creates an element with properties and children.
 export function make<K extends keyof HTMLElementTagNameMap>(
   tag: K,
   properties: Partial<HTMLElementTagNameMap[K]>,
@@ -27,7 +26,7 @@ export function make<K extends keyof HTMLElementTagNameMap>(
 
 export const onClick = (id: string, run: () => void): void => element(id).addEventListener('click', run);
 
-// Creates a button. ariaLabel: name for screen readers, if the text is a symbol.
+// ariaLabel: name for screen readers, if the text is a symbol.
 export const button = (
   text: string,
   { run, ...properties }: { title: string; run: () => void; className?: string; ariaLabel?: string },

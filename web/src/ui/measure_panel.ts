@@ -44,7 +44,6 @@ export class MeasurePanel {
     this.show();
   }
 
-  // Moves lines and labels to their positions in a view.
   drawn(view: View): void {
     const { measures } = this.file.all;
     const dots = measures.flatMap(({ points }): Vec3[] => points);
@@ -80,7 +79,7 @@ export class MeasurePanel {
     this.redraw();
   }
 
-  // Sets the unit by the stated length of the chosen measure.
+  // By the stated length of the chosen measure.
   private setUnit(): void {
     const known = element<HTMLInputElement>('known').valueAsNumber;
     const name = cleared(element<HTMLInputElement>('unit-name').value).trim() || 'm';

@@ -38,14 +38,14 @@ export class NotesPanel {
     return this.all.views.map(({ name }) => name);
   }
 
-  // Goes to a view by name; returns whether it exists.
+  // Returns whether there is a view of that name.
   goTo(name: string): boolean {
     const named = this.all.views.find((view) => view.name === name);
     if (named) this.stage.fly(named.viewpoint);
     return named !== undefined;
   }
 
-  // Moves the markers to their notes' positions in a view; `still`: also finds which are hidden by surfels.
+  // `still`: also finds which markers are hidden by surfels.
   async drawn(view: View, still: boolean): Promise<void> {
     const seen: { marker: HTMLElement; x: number; y: number; z: number }[] = [];
     for (const [{ position }, marker] of this.markers) {

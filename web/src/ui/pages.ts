@@ -45,7 +45,7 @@ export function notify(text: string): void {
   setTimeout(() => (notice.hidden = true), 8000);
 }
 
-// Shows a picture in place of the canvas; returns false if it is none.
+// Returns false if it is no picture.
 async function showPicture(picture: Blob, unless = (): boolean => false): Promise<boolean> {
   const image = element<HTMLImageElement>('poster');
   const address = (image.src = URL.createObjectURL(picture));

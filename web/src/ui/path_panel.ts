@@ -73,7 +73,7 @@ export class PathPanel {
     this.show();
   }
 
-  // Returns the current view while the path plays.
+  // The current view while the path plays.
   advance(now: number): View | null {
     const { playing, path } = this;
     if (!playing || playing.wanted) return playing?.wanted ?? null;
@@ -98,7 +98,6 @@ export class PathPanel {
     if (playing.record) playing.film = new Film(this.canvas);
   }
 
-  // Stops playback, for instance when the user moves the camera.
   stop(): void {
     if (!this.playing) return;
     const { film } = this.playing;

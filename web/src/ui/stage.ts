@@ -1,4 +1,4 @@
-// What the panels share: the viewer, clicks on surfaces of the scene, lines and marks over it, and notes.json.
+// What the panels share: the viewer, clicks on surfaces, lines and marks over the scene, and notes.json.
 import type { Vec3 } from '../bundle/manifest';
 import type { Depths } from '../render/renderer';
 import type { Box } from '../view/crop';
@@ -30,7 +30,7 @@ export function isFull(list: unknown[], most: number, what: string): boolean {
   return list.length >= most;
 }
 
-// Moves a mark to a point of the scene, and hides it outside the picture; returns the point as View.project.
+// Moves a mark to a point of the scene, and hides it outside the picture; returns View.project.
 export function place(mark: HTMLElement, view: View, point: Vec3): Vec3 | null {
   const at = view.project(point);
   mark.hidden = !at;
@@ -89,7 +89,6 @@ export class Picker {
     this.canvas.classList.remove('placing');
   }
 
-  // Starts if the button is not pressed, else stops.
   toggle(button: string, run: (point: Vec3) => void): void {
     if (pressed(element(button))) this.stop();
     else this.start(button, run);
@@ -112,7 +111,6 @@ export type Line = [Vec3, Vec3];
 
 const SVG = 'http://www.w3.org/2000/svg';
 
-// A set of lines of one style.
 export class Lines {
   private readonly path = document.createElementNS(SVG, 'path');
 

@@ -54,7 +54,7 @@ export function parseCameras(text: string): CaptureCamera[] {
     .filter((found) => found !== null);
 }
 
-// Returns the correction of the camera with a given pose; null without such a camera, or if it has none.
+// Null without a camera of that pose, or if it has none.
 export function correctionAt(cameras: CaptureCamera[], pose: Pose): number[] | null {
   const same = (a: Vec3, b: Vec3): boolean => length(subtract(a, b)) < SAME * (1 + length(b));
   const there = cameras.find(

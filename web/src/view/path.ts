@@ -37,7 +37,7 @@ export class CameraPath {
     for (const keyframe of this.keyframes) keyframe.seconds = within(k * keyframe.seconds);
   }
 
-  // Returns the view at a time for a picture size; needs two keyframes.
+  // Needs two keyframes.
   at(time: number, width: number, height: number): View {
     let [segment, rest] = [0, Math.min(Math.max(time, 0), this.seconds)];
     while (segment + 1 < this.segments && rest >= this.keyframes[segment].seconds) {
@@ -116,7 +116,7 @@ export class CameraPath {
     });
   }
 
-  // Loads the keyframes of such a file, or of one written by nerfstudio's viewer; throws if invalid.
+  // Reads such a file, or one of nerfstudio's viewer; throws if invalid.
   load(text: string): void {
     const file = JSON.parse(text) as Record<string, unknown> | null;
     const rows = file?.keyframes;
@@ -144,7 +144,7 @@ export class Flight {
     this.path.keyframes = [from, to].map(({ pose, lens }) => ({ pose, lens, seconds: FLIGHT_SECONDS }));
   }
 
-  // Returns the view at a time for a picture size; null after the end.
+  // Null after the end.
   at(now: number, width: number, height: number): View | null {
     this.since ??= now;
     const t = (now - this.since) / (1000 * FLIGHT_SECONDS);

@@ -21,7 +21,6 @@ export interface Lens {
 
 const NEAR = 1e-3; // depth at which lines end, as a share of that of their farther end
 
-// Coordinates of a point in a camera's frame.
 function inCamera({ position, right, down, forward }: Pose, point: Vec3): Vec3 {
   const from = subtract(point, position);
   return [dot(from, right), dot(from, down), dot(from, forward)];
@@ -38,7 +37,6 @@ export class View implements Lens {
     readonly height: number,
   ) {}
 
-  // Returns the view at another resolution.
   scaledTo(width: number, height: number): View {
     const [x, y] = [width / this.width, height / this.height];
     return new View(this.pose, this.fx * x, this.fy * y, this.cx * x, this.cy * y, width, height);
@@ -100,7 +98,7 @@ function turnedPose(pose: Pose, axis: Vec3, angle: number): Pose {
 
 const STEEPEST = 0.998; // largest cosine between view and vertical when tilting
 
-// Returns true if a camera may tilt without coming too close to the vertical or turning over.
+// Whether a camera may tilt without coming too close to the vertical or turning over.
 function tilts(pose: Pose, up: Vec3, angle: number): boolean {
   const next = turnedPose(pose, pose.right, angle);
   const [before, after] = [Math.abs(dot(pose.forward, up)), Math.abs(dot(next.forward, up))];

@@ -44,7 +44,7 @@ export type Camera = ReturnType<typeof cameraOf>;
 
 const FARTHEST = 1e9;
 
-// Validates a camera from a message; null if invalid.
+// Null if invalid.
 export function viewpointOf(camera: unknown): Viewpoint | null {
   const given = (camera ?? {}) as Partial<Record<keyof Camera, unknown>>;
   const good = (list: unknown, count: number): list is number[] =>

@@ -26,7 +26,7 @@ export function sizeOf(photographed: Float32Array, view: View): number {
   return Math.min(Math.max(sizes[(sizes.length - 1) >> 1], FARTHEST[0]), FARTHEST[1]);
 }
 
-// Returns whether a view of that size is cropped to `partOf`.
+// Whether a view of that size is cropped to `partOf`.
 export const isFar = (size: number): boolean => size < TWO_SAMPLES;
 
 // Bounds the pixels in which surfels can be seen, by spheres around their discs; at least one pixel.

@@ -171,7 +171,7 @@ export type Codes = Float64Array | Int32Array;
 
 const bytesOf = ({ bytes }: Column): number => bytes.reduce((sum, size) => sum + size, 0);
 
-// Checks that the columns are as expected ([name, numbers per row]) and fill the file.
+// Checks that the columns are those expected ([name, numbers per row]) and fill the file.
 export function checkColumns(columns: Column[], expected: [string, number][], size: number, file: string): void {
   const names = (list: string[]): string => list.join(', ') || 'none';
   const listed = names(columns.map((column) => column.name));
@@ -186,7 +186,6 @@ export function checkColumns(columns: Column[], expected: [string, number][], si
   if (stated !== size) throw new DamagedBundle(`${file} has ${size} bytes, its columns need ${stated}.`);
 }
 
-// Reads the columns of a file in order.
 export class ColumnReader {
   private at = 0;
   private next = 0;
@@ -201,7 +200,7 @@ export class ColumnReader {
     return this.columns[this.next]?.name;
   }
 
-  // Reads the next column: an array of `rows` codes per number. blocks: as in decodeIntegers.
+  // Reads the next column: `rows` codes per number.
   read<T extends Codes>(rows: number, make: (rows: number) => T, blocks = 0): T[] {
     const { bytes } = this.columns[this.next++];
     const sums = blocks && bytes.length > 1 ? new Uint8Array(rows) : null;

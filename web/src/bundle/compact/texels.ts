@@ -10,7 +10,6 @@ const MOST_TEXELS = 2 ** 30; // in all pages: four gigabytes
 const BLOCK = 8;
 const FILE = 'texels.bin';
 
-// Lists the tiles in surfel order.
 function tilesOf(surfels: Surfels) {
   const numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
   const tiles = [];
@@ -128,7 +127,7 @@ class Painter {
     });
   }
 
-  // Returns where a block's texels lie in the pages, from its first on.
+  // Returns where a block's texels lie, from its first on.
   private offsets({ u, v }: Blocks): Int32Array {
     return Int32Array.from({ length: u * v }, (_, t) => Math.floor(t / u) * this.atlas.width + (t % u));
   }
@@ -179,7 +178,7 @@ class Painter {
     });
   }
 
-  // Returns the pages, each in its own buffer.
+  // Each in its own buffer.
   layers(): Uint8Array[] {
     const size = this.atlas.width * this.atlas.height;
     return Array.from({ length: this.atlas.layers }, (_, k) => {

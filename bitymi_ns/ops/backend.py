@@ -83,7 +83,7 @@ def _set_up_process() -> None:
 
 
 def give_back_memory() -> None:
-    """Return the memory that the CPU kernels keep for later views to the system, before views of other sizes."""
+    """Return memory that the CPU kernels keep for later views to the system, before views of other sizes."""
     if _set_up_process.cache_info().currsize:  # the CPU kernels have been asked for
         load("_cpu").give_back_memory()
 
@@ -112,8 +112,8 @@ def lookup(name: str, device: torch.device) -> Any:
 
 
 def function(name: str, device: torch.device) -> Callable[..., Any]:
-    """Return a kernel function by name; raises as `lookup`. It takes keyword arguments (csrc/ops) and, on a CUDA
-    device, runs on torch's current stream of that device."""
+    """Return a kernel function, which takes keyword arguments (csrc/ops) and, on a CUDA device, runs on torch's current
+    stream; raises as `lookup`."""
     run = lookup(name, device)
     if device.type != "cuda":
         return run
@@ -126,7 +126,7 @@ def function(name: str, device: torch.device) -> Callable[..., Any]:
 
 
 def stream_of(device: torch.device) -> int:
-    """Return torch's current stream of a CUDA device as a raw handle; 0 for the emulator."""
+    """Return the raw handle of torch's current stream of a CUDA device; 0 for the emulator."""
     if device.type != "cuda":
         return 0
     raw = getattr(torch._C, "_cuda_getCurrentRawStream", None)  # 0.5 us; constructing a Stream takes ten
@@ -148,12 +148,12 @@ def kernel(name: str, like: Tensor) -> Callable[..., Any]:
 
 
 def kernel_class(name: str, like: Tensor) -> type:
-    """Return the class `name` of the kernel module for tensors like `like`; raises as `kernel`."""
+    """Return the class `name` for tensors like `like`; raises as `kernel`."""
     return lookup(_name(name, like), like.device)
 
 
 def workspace(name: str, like: Tensor, **sizes: int) -> Tensor:
-    """Allocate working memory for the CUDA kernel `name`: [bytes] uint8, sized by its function `name`_workspace."""
+    """Allocate working memory for the CUDA kernel `name`, sized by its function `name`_workspace: [bytes] uint8."""
     ask = lookup(_name(f"{name}_workspace", like), like.device)
     with on_device(like.device):
         size = ask(**sizes)
@@ -168,14 +168,14 @@ def on_device(device: torch.device) -> AbstractContextManager[Any]:
 
 
 def on_same_device(like: Tensor, **tensors: Tensor) -> None:
-    """Check that tensors are on the device of `like`. Raises ValueError: names one that is not."""
+    """Raise ValueError for a tensor on another device than `like`."""
     for name, tensor in tensors.items():
         if tensor.device != like.device:
             raise ValueError(f"{name} is on device '{tensor.device}', it must be on '{like.device}'")
 
 
 def check_shapes(**shapes: tuple[Tensor, Sequence[int]]) -> None:
-    """Check the shapes of tensors, by name. Raises ValueError: names one with another shape."""
+    """Raise ValueError for a tensor with another shape."""
     for name, (tensor, shape) in shapes.items():
         if tuple(tensor.shape) != tuple(shape):
             raise ValueError(f"{name} must have shape {list(shape)}, not {list(tensor.shape)}")

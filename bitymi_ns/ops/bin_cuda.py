@@ -30,7 +30,7 @@ def int64s(like: Tensor, count: int) -> Tensor:
 
 
 def check_pair_count(pairs: int, camera: CameraLike) -> None:
-    """Raise a RuntimeError if a view has 2^31 pairs of surfel and tile or more."""
+    """Raise RuntimeError for 2^31 pairs of surfel and tile or more."""
     if pairs >= 2**31:
         raise RuntimeError(
             f"the view has {pairs:,} pairs of surfel and tile, not below 2^31: the surfels are far too large for an "

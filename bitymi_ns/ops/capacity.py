@@ -45,7 +45,7 @@ class TooManyFragments(RuntimeError):
 
 @contextmanager
 def memory_errors() -> Iterator[None]:
-    """Raise MemoryError, as the kernels do, where torch raises RuntimeError because a CPU's memory is full."""
+    """Raise MemoryError, as the kernels do, where torch raises RuntimeError for a lack of the CPU's memory."""
     try:
         yield
     except RuntimeError as error:
@@ -55,7 +55,7 @@ def memory_errors() -> Iterator[None]:
 
 
 def free_memory(device: torch.device) -> int:
-    """Return the free bytes of a CUDA device, including what torch holds unused."""
+    """Return the free bytes of a CUDA device, with what torch holds unused."""
     kept = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
     return torch.cuda.mem_get_info(device)[0] + kept
 

@@ -1,6 +1,5 @@
-"""Sum a view's blending weights by surfel and by texel (coverage).
-
-On the CPU fragments are summed as they are found; on a CUDA device they are listed first."""
+"""Sum a view's blending weights by surfel and by texel (coverage): on the CPU as fragments are found, on a CUDA device
+from lists."""
 
 from typing import Any
 
@@ -68,7 +67,6 @@ def add_texel_coverage(
 
 
 def _sum_fragments(name: str, projection: Projection, bound: float, **arguments: Any) -> None:
-    """Call a CPU kernel that finds the fragments of a view."""
     geom = projection.geom.detach()
     with tile_lists().borrow() as bins:
         kernel(name, geom)(**projection.view(geom), **projection.alpha_arrays, bound=bound, bins=bins, **arguments)

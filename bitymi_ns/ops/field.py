@@ -90,7 +90,7 @@ def fragment_residual(
 
     Args:
         frames: [N, 9] of the projection.
-        geometry, weights: the field (table, w1, w2, w3), as in `field`.
+        weights: table, w1, w2, w3, as in `field`.
         bound: fragments of smaller weight get 0.
         move_surfels: propagate the gradient of rho with respect to x to uv and frames.
 

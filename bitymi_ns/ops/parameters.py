@@ -15,7 +15,7 @@ SMALLEST_SHARE = 1.0 / 1024  # margin of stored sigmoids to 1, and of betas to 0
 
 
 class Tensors(Protocol):
-    """Tensors by name: a `Mapping` or an `nn.ParameterDict`."""
+    """A `Mapping` or an `nn.ParameterDict`."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
     def __contains__(self, name: Any, /) -> bool: ...

@@ -17,18 +17,12 @@ from .texel import TexelAlpha
 
 
 class Pinhole(Protocol):
-    """A pinhole camera.
-
-    Attributes:
-        viewmat: [4, 4] world to camera, OpenCV axes.
-        K: [3, 3] intrinsics in pixels.
-        width, height: of the image in pixels.
-    """
+    """A pinhole camera of an image of width x height pixels."""
 
     @property
-    def viewmat(self) -> Tensor: ...
+    def viewmat(self) -> Tensor: ...  # [4, 4] world to camera, OpenCV axes
     @property
-    def K(self) -> Tensor: ...
+    def K(self) -> Tensor: ...  # [3, 3] intrinsics in pixels
     @property
     def width(self) -> int: ...
     @property
@@ -36,17 +30,12 @@ class Pinhole(Protocol):
 
 
 class CameraLike(Pinhole, Protocol):
-    """`scene.camera.Camera`, as far as it is used here.
-
-    Attributes:
-        skewed: whether K[0, 1] is not 0, which the kernels do not support.
-        exact_center: [3] float64 camera centre, world.
-    """
+    """`scene.camera.Camera`, as far as it is used here."""
 
     @cached_property
-    def skewed(self) -> bool: ...
+    def skewed(self) -> bool: ...  # whether K[0, 1] is not 0
     @cached_property
-    def exact_center(self) -> Tensor: ...
+    def exact_center(self) -> Tensor: ...  # [3] float64 camera centre, world
     def part(self, left: int, top: int, right: int, bottom: int) -> CameraLike: ...
     def local(self, points: Tensor) -> Tensor: ...
 
@@ -99,9 +88,8 @@ class Projection:
 
     def view(self, geom: Tensor) -> dict[str, Any]:
         """The kernels' arguments for a view (`View` of csrc/ops/visibility.h). `geom`: `self.geom`, detached."""
-        size = {"width": self.camera.width, "height": self.camera.height}
-        drawn = {"near": self.near, "photo_pixel": self.photo_pixel}
-        return dict(geom=geom, radii=self.radii, **size, **drawn)
+        size = {"width": self.camera.width, "height": self.camera.height, "near": self.near}
+        return {"geom": geom, "radii": self.radii, **size, "photo_pixel": self.photo_pixel}
 
     @property
     def alpha_arrays(self) -> dict[str, Any]:
@@ -219,7 +207,7 @@ def project(
     photo_pixel: float = 1.0,
     alpha: TexelAlpha | None = None,
 ) -> Projection:
-    """Project surfels into a camera (2DGS ray-splat formulation in coordinates centred on the projected mean).
+    """Project surfels into a camera (2DGS ray-splat formulation, centred on the projected mean).
 
     Args:
         means: [N, 3] world positions.

@@ -34,7 +34,7 @@ class TexelTiles:
         return cls(area.cumsum(0) - area, size.to(torch.int32).contiguous(), extent.contiguous())
 
     def rows_of(self, surfels: Tensor) -> Tensor:
-        """List the texel rows [t] int64 of surfels [n] int64, tile after tile."""
+        """List the texel rows [t] int64 of surfels [n], tile after tile."""
         area = self.size[surfels].long().prod(dim=1)
         shift = self.first[surfels] - (area.cumsum(0) - area)
         return shift.repeat_interleave(area) + torch.arange(int(area.sum()), device=area.device)
@@ -46,7 +46,7 @@ class TexelTiles:
 
     @functools.cached_property
     def count(self) -> int:
-        """T: texels of all tiles; read from the device once."""
+        """Texels of all tiles; read from the device once."""
         return int(self.size.long().prod(dim=1).sum())
 
 

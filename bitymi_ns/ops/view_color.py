@@ -30,7 +30,7 @@ def _flags(active: Tensor) -> Tensor:
 
 
 def lettered(parameters: Sequence[Tensor], prefix: str = "") -> dict[str, Tensor]:
-    """Name parameters as the kernels do: a, b and, if there is a third, c."""
+    """Name parameters as the kernels do: a, b and c."""
     return {prefix + letter: p for letter, p in zip("abc", parameters, strict=False)}
 
 

@@ -12,18 +12,18 @@ const BOUND_PAD: f32 = 0.02;  // pixels
 const WIDEST: f32 = 1e5;  // pixels; larger surfels cover the whole screen
 const LEAST_ANGLE: f32 = 1e-6;  // between the lines U = 0 and V = 0; below, the disc's image is lost to rounding
 
-// Computes the squared radius in scale units where the kernel is exp(-level) of its maximum, slightly enlarged.
+// Squared radius in scale units where the kernel is exp(-level) of its maximum, slightly enlarged.
 fn level_radius2(level: f32, beta: f32) -> f32 {
   return SUPPORT2 * min(1.0, (1.0 - exp(-level / max(beta, 1e-6))) * 1.0002 + 4e-6);
 }
 
-// Computes the major principal axis of the ellipse [p q] (unit circle).
+// Major axis of the ellipse [p q] (unit circle).
 fn major_axis(p: vec2f, q: vec2f) -> vec2f {
   let angle = 0.5 * atan2(2.0 * (p.x * p.y + q.x * q.y), p.x * p.x + q.x * q.x - p.y * p.y - q.y * q.y);
   return vec2f(cos(angle), sin(angle));
 }
 
-// Computes the extent of the disc's image along `e`: x = P.q / (1 + C.q) on the unit disc, `rest` = 1 - |C|^2.
+// Extent of the disc's image along `e`: x = P.q / (1 + C.q) on the unit disc, `rest` = 1 - |C|^2.
 fn reach(e: vec2f, p: vec2f, q: vec2f, c: vec2f, rest: f32) -> vec2f {
   let along = vec2f(dot(e, p), dot(e, q));
   let pc = dot(along, c);
@@ -46,7 +46,7 @@ fn finish(center: vec2f, axis: vec2f, low: vec2f, high: vec2f) -> Rectangle {
   return Rectangle(true, axis, center + axis * middle.x + vec2f(-axis.y, axis.x) * middle.y, half_size);
 }
 
-// Returns true if the visible part of a disc lies beyond a border of the image; core/bounds.h.
+// Whether the visible part of a disc lies beyond a border of the image: core/bounds.h.
 fn beyond_border(along: vec2f, c: vec2f, border: f32) -> bool {
   let off = along - border * c;
   let far = abs(border);

@@ -1,11 +1,11 @@
 // Adaptation of surfels to views of another size than the photographs, as core/resize.h and core/texel.h.
 
-// Computes the variance that a pixel adds along each axis, pixels^2.
+// Variance that a pixel adds along each axis, pixels^2.
 fn pixel_variance() -> f32 {
   let p = frame.photo_pixel;
   return max(0.0, (1.0 - p * p) / 12.0);
 }
-// Computes 1 / squared radius of the low pass.
+// 1 / squared radius of the low pass.
 fn low_pass_sharp() -> f32 {
   let p = frame.photo_pixel;
   return 1.0 / (p * p + 2.0 * pixel_variance());

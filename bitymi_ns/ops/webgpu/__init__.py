@@ -1,7 +1,4 @@
-"""Rendering of baked scenes through WebGPU, on any vendor's GPU, with the shaders of the browser viewer.
-
-Requires the optional package `wgpu` (`pip install 'bitymi-ns[webgpu]'`).
-"""
+"""Rendering of baked scenes through WebGPU, with the shaders of the browser viewer and the optional package `wgpu`."""
 
 from .device import WebGpuUnavailable
 from .on_device import draw

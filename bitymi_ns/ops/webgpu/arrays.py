@@ -101,7 +101,7 @@ def _set_tiles(surfels: npt.NDArray, scene: BakedSceneLike) -> None:
 
 
 def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, Tensor, Tensor]:
-    """Return the form, base [N, 3], first term and number of terms [N, 2], and terms."""
+    """Return form, base [N, 3], first term and number of terms [N, 2], and terms."""
     if "view_terms" in p:
         check_reduced(kind, p, n)
         base, span, terms = (p[name] for name in REDUCED)

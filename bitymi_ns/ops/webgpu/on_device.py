@@ -173,7 +173,7 @@ class SceneOnDevice:
         self._pages_bound = self._group(self._programs.layout[1], views[0], sampler, views[1])
 
     def _make_coarser(self) -> None:
-        """Make the levels 1 and 2 of all pages, for the first view smaller than the photographs."""
+        """Make the levels 1 and 2 of all pages."""
         format = "rgba8unorm" if self._atlas.format == "bc7-rgba-unorm" else self._atlas.format
         width, height, layers = self._atlas.size
         flags = library().TextureUsage

@@ -97,7 +97,7 @@ class Programs:
         return self._draw({"operation": "add", "src_factor": "one", "dst_factor": "one"})
 
     def halve(self, format: str, alpha: bool) -> Any:
-        """Build the pipeline that halves a page into a target of this format, with `alpha` weighting colours by it."""
+        """Pipeline that halves a page into a target of this format, with `alpha` weighting colours by it."""
         entry = f"halve{'_alpha' if alpha else ''}_{'bytes' if format == 'rgba8unorm' else 'floats'}"
         module = shader("halve")
         return device().create_render_pipeline(

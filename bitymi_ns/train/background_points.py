@@ -1,5 +1,5 @@
-"""Additional initial points in parts of the photographs without sparse points. In a short run, densification splits the
-few large surfels there too rarely (docs/benchmarks/training.md, Background points)."""
+"""Additional initial points where photographs show no sparse points: in a short run, densification splits the few large
+surfels there too rarely (docs/benchmarks/training.md, Background points)."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from bitymi_ns.scene.camera import Camera
 from .views import View, as_float, downscale_image, downscale_mask
 
 CELLS = 24  # maximum number of cells along the longer side of a photograph
-POINTS_PER_CELL = 4  # minimum average of points per cell: with fewer, cells may be empty by chance
+POINTS_PER_CELL = 4  # minimum average: with fewer points, cells may be empty by chance
 MOST_VIEWS = 100  # maximum number of photographs searched for empty cells, evenly spaced
 NEAREST, FARTHEST = 1.2, 5.0
-"""Depth range of the new points, in multiples of the median depth of the points visible in the photograph."""
+"""Depth range of the new points, relative to the median depth of the points visible in the photograph."""
 FEW = 10  # photographs with fewer points use the median depth of the others
 RADIUS = 0.5  # largest initial scale, in cells
 OPAQUE = 0.5  # minimum mean alpha of a cell
-SUPPORT = 8  # minimum number of photographs with the point in an empty cell: with fewer, a run on 17 overfitted
-IN_FRONT = 0.2  # maximum number of photographs with the point in front of a cell's points, per such photograph
+SUPPORT = 8  # minimum number of photographs with the point in an empty cell: with fewer, training overfits
+IN_FRONT = 0.2  # maximum number of photographs with the point in front of a cell's points, relative to those
 
 
 class BackgroundPoints(NamedTuple):
@@ -38,13 +38,12 @@ class BackgroundPoints(NamedTuple):
 def background_points(points: Tensor, views: Sequence[View], seed: int) -> BackgroundPoints:
     """Sample points behind the cells of the photographs that no sparse point projects to.
 
-    A cell's point lies on the ray of a random pixel in it, at a depth that is log-uniform between `NEAREST` and
-    `FARTHEST` times the median depth of the points visible in the photograph: between a wall and the sky. Masked and
-    transparent cells get none. A point is kept if it projects into an empty cell of at least `SUPPORT` photographs, so
-    that training can determine its depth, and in front of a cell's points in few.
+    A cell's point lies on the ray of a random pixel in it, at a log-uniform depth (`NEAREST`, `FARTHEST`). Masked and
+    transparent cells get none. A point is kept if enough photographs (`SUPPORT`) have it in an empty cell for training
+    to determine its depth, and few in front of a cell's points.
 
     Args:
-        points: [M, 3] world positions; non-finite ones are ignored.
+        points: [M, 3] world positions; those that are not finite are ignored.
         views: training photographs at full size.
         seed: seed of the random pixels, depths and order.
 
@@ -91,8 +90,8 @@ class _Grid(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, x: Tensor, y: Tensor, z: Tensor, count: float) -> _Grid:
-        """Bin the points of a view into nearly square cells. `x` and `y` and `z`: [V] pixel coordinates and camera z.
-        `count`: number of points that decides the size of the cells."""
+        """Bin the points of a view, [V] pixel coordinates and camera z, into nearly square cells. `count`: number of
+        points that decides their size."""
         longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
         side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))
         rows, columns = math.ceil(camera.height / side), math.ceil(camera.width / side)
@@ -106,14 +105,14 @@ class _Grid(NamedTuple):
         return row * columns + column
 
     def at(self, x: Tensor, y: Tensor) -> Tensor:
-        """Return `nearest` at pixels [V] inside the image."""
+        """Return `nearest` at pixels [V]."""
         return self.nearest.view(-1)[self._index(x, y)]
 
 
 def _points_behind(
     view: View, camera: Camera, grid: _Grid, median: float, generator: torch.Generator
 ) -> BackgroundPoints:
-    """Sample a point behind each empty cell of a view whose points have the given median depth, camera z."""
+    """Sample a point behind each empty cell of a view whose points have the median depth `median`."""
     rows, columns = grid.nearest.shape
     small = downscale_image(as_float(view.image.cpu()), columns, rows)  # [rows, columns, C]
     empty = grid.nearest.isinf()

@@ -16,18 +16,15 @@ TOGETHER = 4  # steps whose losses are copied to the host together
 
 
 class LossWatch:
-    """Detector of losses that are not finite.
-
-    On a CUDA device losses of several steps are copied to the host asynchronously and checked a few steps later.
-    """
+    """Detector of losses that are not finite. On a CUDA device losses of several steps are copied to the host
+    asynchronously and checked a few steps later."""
 
     def __init__(self) -> None:
         self._pending: list[tuple[int, tuple[str, ...], list[Tensor]]] = []
         self._in_flight: deque[tuple[list[tuple[int, tuple[str, ...]]], Tensor, torch.cuda.Event]] = deque()
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
-        """Check the loss terms of a step; on a CUDA device, a few steps later. Raises TrainingDiverged: a term of this
-        or an earlier step is not finite."""
+        """Check the loss terms of a step. Raises TrainingDiverged: one of this or an earlier step is not finite."""
         names, values = tuple(terms), [term.detach() for term in terms.values()]
         if values[0].device.type != "cuda":
             self._check(scene, [(step, names)], torch.stack(values))
@@ -50,14 +47,14 @@ class LossWatch:
         self._pending = []
 
     def finish(self, scene: Scene) -> None:
-        """Wait for pending losses and check them; raises what `note` raises."""
+        """Wait for pending losses and check them, as `note` does."""
         self._send()
         while self._in_flight:
             self._in_flight[0][2].synchronize()
             self._check(scene, *self._in_flight.popleft()[:2])
 
     def forget(self) -> None:
-        """Discard pending losses after a rollback."""
+        """Discard pending losses."""
         self._in_flight.clear()
         self._pending.clear()
 
@@ -71,7 +68,7 @@ class LossWatch:
 
 
 class TrainingDiverged(ValueError):
-    """Training has diverged: loss, field or surfels are not finite, or no rollback is left."""
+    """Training has diverged and cannot go on."""
 
 
 def describe_broken(module: nn.Module) -> str:

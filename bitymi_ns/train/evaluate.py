@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 
 @dataclass
 class Quality:
-    """Means over views; NaN without views."""
+    """Means over views, of PSNR over those with unmasked pixels; NaN without any."""
 
-    psnr: float  # dB, over the views with unmasked pixels, with interpolated exposures (`Exposure.at`)
+    psnr: float  # dB, with interpolated exposures (`Exposure.at`)
     fragments: float  # blended fragments per view
-    fitted_psnr: float  # dB after an affine fit of each view's colours (`losses.color_fitted`), over the same views
+    fitted_psnr: float  # dB after an affine fit of each view's colours (`losses.color_fitted`)
     carried_psnr: float = math.nan  # dB with poses corrected as those of the nearest photographs
     refined_psnr: float = math.nan  # dB with poses aligned to the scene
     mean_exposure_psnr: float = math.nan  # dB with the mean exposure, where the run corrects photographs
@@ -39,13 +39,12 @@ def evaluate(
     poses: Poses | None = None,
     exposure: Exposure | None = None,
 ) -> Quality:
-    """Compare renders of a scene with photographs, over the evaluation background.
+    """Compare renders of a scene with photographs over the evaluation background.
 
     Args:
         views: at full size; each is read once.
-        poses: poses of a run that refined them: views are also evaluated with the corrections of the nearest
-            photographs, and with poses then aligned to the scene.
-        exposure: if it corrects the run's photographs, views get corrections interpolated from theirs.
+        poses: of a run that refined them: views are also evaluated with poses carried over and aligned.
+        exposure: views get corrections interpolated from the run's, if it has any.
     """
     device = scene.surfels["means"].device
     background = eval_background(config, device)

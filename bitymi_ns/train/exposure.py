@@ -1,9 +1,8 @@
 """Exposure and white balance of the training photographs: a learned colour correction per photograph.
 
-A photograph maps the scene's colour c to gain * c, with a gain per channel, or to matrix @ c + offset. Corrections are
-relative to the mean photograph: after every step log gains and other entries are shifted to sum to zero over the
-photographs, so that they do not tint the scene. They are not part of the scene: a free camera shows the mean exposure;
-`Exposure.at` interpolates that of a held-out photograph.
+A photograph maps the scene's colour c to gain * c, with a gain per channel, or to matrix @ c + offset. After every step
+log gains and other entries are shifted to sum to zero over the photographs, so that they do not tint the scene. A free
+camera shows the mean exposure; `Exposure.at` interpolates that of a held-out photograph.
 """
 
 import math
@@ -24,11 +23,11 @@ from .views import OnDemand, View
 LIMIT = 2.0  # largest log gain: 7.4 times as bright, about 6 stops in gamma-encoded colours
 OTHER_LIMIT = 0.5  # largest other entry of an affine correction
 EXPLAINED = 0.1
-"""`auto` corrects photographs if gains explain more than this part of their disagreement at the points."""
-EXIF_SPREAD = 0.03  # without enough points, `auto` corrects photographs if their EXIF gains deviate by this (0.1 stop)
+"""`auto` corrects photographs if gains explain more of their disagreement at the points (`gains`)."""
+EXIF_SPREAD = 0.03  # without enough points, `auto` corrects if EXIF gains deviate by this (0.1 stop)
 PRIOR_POINTS = 20  # weight of the EXIF prior (mean exposure if unknown), in points
-BETAS = (0.9, 0.99)  # Adam's betas: a photograph is used once per epoch, so averages must be short
-EPS = 1e-8  # Adam's epsilon
+BETAS = (0.9, 0.99)  # of Adam: averages are short, as a photograph is used once per epoch
+EPS = 1e-8  # of Adam
 ENCODING = 2.2  # gamma of encoded colours
 
 
@@ -36,8 +35,8 @@ class Exposure:
     """Colour corrections of a run.
 
     Attributes:
-        table: [V, 3] log gains of V photographs; for affine corrections [V, 12], the rows of [matrix | offset] with log
-            gains on the diagonal. None: no corrections.
+        table: [V, 3] log gains of V photographs; affine: [V, 12], rows of [matrix | offset], log gains on the diagonal.
+            None: no corrections.
         decided: True once `start` was called or a state loaded.
         reason: why photographs are corrected or not; empty until decided.
     """
@@ -47,9 +46,8 @@ class Exposure:
     ) -> None:
         """
         Args:
-            exif: log2 exposure of each training view (`exif_stops`), NaN: unknown; None: unknown for every view.
-            files: photograph of each training view; views of one photograph share its correction. None: one view per
-                photograph, and `at` returns None.
+            exif, files: as in `TrainingData`; views of one photograph share its correction. Without files `at` returns
+                None.
         """
         self.kind: ExposureKind = kind
         self.table: Tensor | None = None
@@ -65,8 +63,7 @@ class Exposure:
         self._learning: list[tuple[int, Tensor]] = []
 
     def start(self, points: Tensor, views: Sequence[View], near: float) -> None:
-        """Decide whether to correct photographs, and initialise the corrections. `points`: [M, 3], best those of the
-        capture. `views`: at full size. `near`: near plane, camera z."""
+        """Decide whether to correct photographs, and initialise the corrections. Arguments as of `estimate_gains`."""
         self.decided = True
         agreement = estimate_gains(points, views, near)
         prior = self._pooled(exif_gains(self._exif, len(views)), torch.ones(len(views)))
@@ -99,7 +96,7 @@ class Exposure:
         return values.new_zeros(self.count(len(values)), values.shape[1]).index_add_(0, rows, values)
 
     def _pooled(self, values: Tensor, weights: Tensor) -> Tensor:
-        """Average values [V, C] over the views of each photograph with weights [V]; 0 if all weights are 0."""
+        """Average values [V, C] over the views of each photograph with weights [V]; 0 where they are 0."""
         if self._photographs is None:
             return values
         weights = weights[:, None]
@@ -111,7 +108,7 @@ class Exposure:
 
     @property
     def sentence(self) -> str:
-        """Message for the console: corrections and their reason; empty without corrections."""
+        """Describe the corrections and their reason; empty without corrections."""
         gains = self.log_gains
         if gains is None:
             return ""
@@ -145,7 +142,7 @@ class Exposure:
     @torch.no_grad()
     def at(self, file: Path | None) -> Tensor | None:
         """Return the correction of a photograph of the capture, as `of` does: its own, or interpolated between training
-        photographs (`Neighbours`) as log gains and other entries. None: mean exposure."""
+        photographs (`Neighbours`). None: mean exposure."""
         neighbours = None if file is None else self._neighbours.of(file)
         if self.table is None or neighbours is None:
             return None
@@ -154,7 +151,7 @@ class Exposure:
 
     @torch.no_grad()
     def step(self, rate: float, processes: Processes = ALONE) -> None:
-        """Update the corrections that `learning` returned by their gradients, averaged over the processes' views."""
+        """Update the corrections that `learning` returned by their gradients, averaged over all views of the step."""
         learning, self._learning = self._learning, []
         if self.table is None or self._moments is None:
             return
@@ -196,8 +193,7 @@ class Exposure:
         return [(row, sums[row, :-1] / processes.views) for row in seen]
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a resumed run, Adam's in the form of torch's optimisers: tensors, numbers and strings
-        only."""
+        """Return the state for a resumed run, Adam's in the form of torch's optimisers."""
         adam = None
         if self._moments is not None:
             mean, square = (moment.clone() for moment in self._moments)
@@ -214,9 +210,9 @@ class Exposure:
     def load_state_dict(
         self, state: Mapping[str, Any] | None, views: int | None = None, device: torch.device | str | None = None
     ) -> None:
-        """Restore what `state_dict` returned. Ignores state saved with another option or number of photographs.
+        """Restore what `state_dict` returned; ignores state saved with another option or number of photographs.
         `state`: None: saved before corrections existed. Then, and after `off`, `auto` makes none. `views`: number of
-        training views; None: as then. `device`: device for the corrections; None: that of `state`."""
+        training views; None: as then. `device`: None: that of `state`."""
         if state is None or (self.kind == "auto" and state["kind"] == "off"):  # corrections do not begin midway
             self.decided = self.kind in ("off", "auto")
             return
@@ -236,7 +232,7 @@ class Exposure:
 
 
 def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] | None = None) -> Exposure:
-    """Restore the corrections of a finished run of `views` training views; none if their number differs."""
+    """Restore the corrections of a finished run; none if it had another number than `views` of training views."""
     exposure = Exposure("off" if state is None else state["kind"], files=files)
     exposure.load_state_dict(state, views)
     return exposure
@@ -245,7 +241,7 @@ def restored(state: Mapping[str, Any] | None, views: int, files: Sequence[Path] 
 def corrected(
     views: Sequence[View], state: Mapping[str, Any] | None, files: Sequence[Path] | None = None
 ) -> Sequence[View]:
-    """Add the final corrections of a run to its training views at full size. `state` and `files`: of its `Exposure`.
+    """Add the final corrections of a run to its training views at full size. `state`, `files`: of its `Exposure`.
     Raises ValueError: the number of photographs differs from the run's."""
     if state is None or state["table"] is None:
         return views
@@ -254,7 +250,7 @@ def corrected(
         count = exposure.count(len(views))
         raise ValueError(
             f"training learned the exposure of {len(state['table'])} photographs, and now there are {count}: restore "
-            "the capture, or leave the texels as they are baked (--finetune-steps 0)"
+            "the capture, or do not tune the texels (--finetune-steps 0)"
         )
     with torch.no_grad():
         corrections = [exposure.of(i) for i in range(len(views))]
@@ -262,7 +258,7 @@ def corrected(
 
 
 def settled(table: Tensor) -> Tensor:
-    """Project a table [V, 3] or [V, 12] to an admissible one: finite, columns of mean 0 and within their limits."""
+    """Project a table to an admissible one: finite, columns of mean 0 and within their limits."""
     limit = table.new_full(table.shape[1:], OTHER_LIMIT)
     limit[_diagonal(table)] = LIMIT
     table = torch.maximum(torch.minimum(table.detach().nan_to_num(0.0), limit), -limit)
@@ -280,13 +276,13 @@ def _correction(row: Tensor) -> Tensor:
 
 
 def _diagonal(table: Tensor) -> slice:
-    """Select the columns of the log gains. A slice, because an index list would be copied to the GPU in every step."""
+    """Select the columns of the log gains: by a slice, as an index list is copied to the GPU in every step."""
     return slice(None) if table.shape[-1] == 3 else slice(0, None, 5)
 
 
 def exif_gains(stops: Sequence[float] | None, count: int) -> Tensor:
-    """Compute initial log gains [V, 3] of `count` photographs from their EXIF exposures (`exif_stops`), for
-    gamma-encoded colours; 0 if unknown."""
+    """Compute initial log gains [V, 3] of `count` photographs from their EXIF exposures (`exif_stops`); 0 if
+    unknown."""
     if stops is None:
         return torch.zeros(count, 3)
     light = torch.tensor(stops, dtype=torch.float64) * math.log(2.0)

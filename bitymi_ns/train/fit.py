@@ -1,4 +1,4 @@
-"""Training loop without nerfstudio, for benchmarks and tests; both use the same `Training` steps."""
+"""Training loop without nerfstudio, for benchmarks and tests."""
 
 from __future__ import annotations
 
@@ -26,27 +26,25 @@ if TYPE_CHECKING:
 
 @dataclass(kw_only=True)
 class LogEntry(Quality):
-    """The state of a run after `step` steps, with the quality of the evaluation views; poses are aligned after the last
-    step alone."""
+    """State of a run after `step` steps, and quality of the evaluation views, with aligned poses after the last step
+    alone."""
 
     step: int
     seconds: float  # Wall-clock time of training, without evaluation.
-    cpu_seconds: float  # Processor time of training over all threads, without evaluation.
+    cpu_seconds: float  # CPU time, likewise.
     surfels: int
     loss: float  # Objective of the last training step.
 
 
 @dataclass
 class TrainLog:
-    """Log of a run."""
-
     entries: list[LogEntry] = field(default_factory=list)
-    events: list[dict[str, float]] = field(default_factory=list)  # Reports of the strategy, each with its `step`.
+    events: list[dict[str, float]] = field(default_factory=list)  # Reports of the strategy, with `step`.
     cameras: list[Camera] = field(default_factory=list)  # Training cameras, with refined poses if any.
 
 
 class Trainer:
-    """One training run, step by step.
+    """A training run, step by step.
 
     Attributes:
         training: the run.
@@ -67,7 +65,7 @@ class Trainer:
             scene: changed in place.
             views: training views at full size.
             max_steps: length of the run; the schedules depend on it.
-            processes: the run's processes; each is given the same scene and views.
+            processes: each is given the same scene and views.
         """
         if not views:
             raise ValueError("there is nothing to train on: no views")
@@ -84,7 +82,7 @@ class Trainer:
         self._terms: list[Tensor] = []
 
     def advance(self) -> tuple[dict[str, Tensor], RenderOutput | ComparedView, dict[str, float]]:
-        """Do one step; return the loss terms and render of its (last) view, and the strategy's report."""
+        """Do a step; return the loss terms and render of its last view, and the strategy's report."""
         self.training.begin(self.step)
         forget_gradients(self.optimizers.values())
         for number in self.training.processes.view_numbers(self.step):
@@ -118,7 +116,7 @@ def fit(
     Args:
         views: training views at full size.
         callback: called after each step.
-        eval_steps: numbers of steps after which an entry is logged; the last step always gets one.
+        eval_steps: numbers of steps after which an entry is logged, also after the last step.
     """
     trainer = Trainer(scene, views, config, max_steps)
     clock, log = trainer.training.clock, TrainLog()

@@ -1,4 +1,4 @@
-"""Estimate what a run will cost: its surfels, and when it will end by the time of its steps so far."""
+"""Estimates of the surfels of a run, and of the time that is left by its steps so far."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ if TYPE_CHECKING:
 Steps = npt.NDArray[np.float64]
 """A number for each step of a run."""
 
-GROWTH = 1.19  # factor of the number of surfels per densification, as measured on the captures of docs/training.md
-SURFELS_PER_PIXEL = 0.4  # surfels per pixel of a view at which they hardly grow any more
+GROWTH = 1.19  # of the surfels per densification, on the captures of docs/training.md
+SURFELS_PER_PIXEL = 0.4  # of a view, at which their number hardly grows any more
 KEPT = 0.7  # part of the surfels that the error prune leaves
 SURFEL = 1.5  # cost of a surfel in a step, relative to that of a pixel
 TEXELS = 1.5  # cost of a step with texels, relative to one without
 DRAWN = 0.5  # cost of a view that is drawn only, relative to a step
 WARM = 2  # first steps of a run, which are slower
 ENOUGH, PATIENCE = 20, 10.0  # steps, or seconds, after which the estimate is stated
-RECENT = 100  # steps over which times are averaged, the last one counting most
+RECENT = 100  # steps of the exponential averages of times
 
 
 def expected_surfels(schedule: Schedule, first: int, pixels: float, most: int = 0) -> Steps:
     """Estimate the number of surfels in each step of a run that starts with `first`. `pixels`: of a view at full size.
-    `most`: number at which densification stops; 0: no limit."""
+    `most`: `Strategy.most`."""
     given = schedule.config.densify.max_surfels
     limit = given or max(first, min(most or np.inf, SURFELS_PER_PIXEL * pixels))
     factors = np.ones(schedule.max_steps)
@@ -41,9 +41,9 @@ def expected_surfels(schedule: Schedule, first: int, pixels: float, most: int = 
 
 
 class Forecast:
-    """Time that a run will still take. A step costs in proportion to its pixels and surfels, and what it draws beside
-    its view adds to it; a unit of this cost takes as long as it took in the last steps, and longer at sizes of pictures
-    at which a measured step did (`compare_sizes`).
+    """Time that a run will still take. A step costs in proportion to its pixels and surfels, those of views that it
+    only draws included; a unit of this cost takes as long as in the last steps, scaled by sizes of pictures as measured
+    (`compare_sizes`).
 
     Attributes:
         left: seconds to the end of the run; None before the first steps.
@@ -65,9 +65,9 @@ class Forecast:
             views: number of training views.
             pixels: mean of a view at full size.
             surfels: in each step (`expected_surfels`).
-            evaluated: number of views evaluated after a step, by step.
+            evaluated: number of views evaluated, by step.
             first: step with which the run begins, or goes on.
-            on_gpu: the run is on a GPU, where small pictures take as long as large ones.
+            on_gpu: small pictures take as long as large ones.
         """
         steps = schedule.max_steps
         sizes = np.array([1.0 if on_gpu else schedule.resolution_factor(step) for step in range(steps)])
@@ -82,7 +82,7 @@ class Forecast:
             at_full_size[step] += DRAWN * count
         self._of_step, self._at_full_size = of_step, at_full_size
         self._sizes, self._pixels, self._surfels = sizes, pixels, surfels
-        self._measured, self._times = np.zeros(1), np.ones(1)  # logarithm of a size, and how much longer a unit takes
+        self._measured, self._times = np.zeros(1), np.ones(1)  # logarithms of sizes, relative times of a unit
         self._beside = 0.0  # units that a step costs beside its views
         self._begin, self._warm = (0.0, 0.0), first + WARM
         self._seconds = self._cpu = self._steps = self._done = 0.0  # of the last steps: times, their number and units
@@ -95,7 +95,7 @@ class Forecast:
         self._after = self._units[::-1].cumsum()[::-1] - self._units
 
     def _cost(self, side: float = 1.0) -> Steps:
-        """Compute the cost of each step if the sides of all pictures were `side` times as long."""
+        """Compute the cost of each step, of pictures with `side` times longer sides."""
 
         def of_view(sizes: Steps | float) -> Steps:
             longer = np.interp(np.log(side * sizes), self._measured, self._times)
@@ -104,14 +104,12 @@ class Forecast:
         return self._of_step * of_view(self._sizes) + self._at_full_size * of_view(1.0) + self._beside
 
     def compare_sizes(self, step: int, seconds: Mapping[float, float]) -> None:
-        """Let steps at other sizes take as long as they were measured to take.
-
-        Memory of large fragment lists comes from the system in every step, and larger ones still are made in bands, so
-        that a fragment can take twice as long in large pictures; how much longer depends on the machine.
+        """Let steps at other sizes take as long as measured: with longer fragment lists, whose memory comes from the
+        system in every step or which are made in bands, a fragment can take twice as long.
 
         Args:
             step: at which they were measured.
-            seconds: CPU seconds of a view in a step, by factor of the sides of pictures; of the size of this step, too.
+            seconds: CPU seconds of a view in a step, by factor of the sides of pictures, that of this step included.
         """
         sizes = np.array(sorted(seconds))
         beside = max(0.0, self._cpu / self._steps - seconds[self._sizes[step]])
@@ -124,11 +122,10 @@ class Forecast:
         self._estimate(step)
 
     def begin(self) -> None:
-        """Note that a step begins."""
         self._begin = time.perf_counter(), time.process_time()
 
     def end(self, step: int) -> None:
-        """Note that a step has ended, with what belongs to it."""
+        """Count the time since `begin` for a step."""
         if step >= self._warm:
             fade = 1.0 - 1.0 / RECENT
             self._seconds = fade * self._seconds + time.perf_counter() - self._begin[0]
@@ -143,7 +140,7 @@ class Forecast:
         self.left = float(self._seconds / self._done * self._after[step])
 
     def half(self) -> float:
-        """Compute the factor of the pictures' sides by which the whole run takes half as long; 0 if none does."""
+        """Compute the factor of the pictures' sides at which the whole run takes half as long; 0 if none does."""
         low, high, wanted = 0.0, 1.0, 0.5 * self._units.sum()
         for _ in range(20):
             middle = 0.5 * (low + high)

@@ -1,7 +1,7 @@
 """Gains of photographs from their colours at the sparse points.
 
-In logarithms, observation = point + photograph, solved by alternating medians (median polish), which are robust to
-highlights, occluders and wrong points. Points occluded by others in a photograph are ignored there.
+In logarithms, observation = point + photograph, solved by median polish, which is robust to highlights and wrong
+points. Points occluded by others in a photograph are ignored there.
 """
 
 import math
@@ -15,32 +15,31 @@ from torch.nn.functional import max_pool2d
 from bitymi_ns.scene.camera import Camera
 from .views import View, as_float
 
-POINTS = 6000  # maximum number of points compared
-HIDING = 100_000  # maximum number of points that may occlude them
+POINTS = 6000  # maximum number compared
+HIDING = 100_000  # maximum number that may occlude them
 OBSERVATIONS = 1_200_000  # maximum of points times photographs
 SWEEPS = 10  # passes of the median polish
-DARKEST, BRIGHTEST = 0.03, 0.97  # range of channel values used: beyond, noise, rounding and clipping dominate
+DARKEST, BRIGHTEST = 0.03, 0.97  # beyond these channel values noise, rounding and clipping dominate
 FEWEST_PHOTOGRAPHS = 3  # minimum number of photographs that show a point
 CELL = 2.0  # side of the cells of the occlusion test, in mean spacings of the projected points
-HIDDEN = 0.05  # an occluding point is nearer by this part of its depth, or of twice the view's depth range if less
+HIDDEN = 0.05  # an occluder is nearer by this part of its depth, or of twice the view's depth range if less
 FEWEST_TESTED = 1000  # minimum number of observations to test gains on the other half of the points
 
 
 class ExposureGains(NamedTuple):
     """Gains of the photographs, and how well they explain the colour differences."""
 
-    log_gains: Tensor  # [V, 3] float32 natural logarithm of each photograph's gain per channel; each channel has mean 0
-    points: Tensor  # [V] int64, number of points used for each photograph
+    log_gains: Tensor  # [V, 3] float32, natural logarithms, of mean 0 in each channel
+    points: Tensor  # [V] int64, number of points used
     # fraction by which gains from half of the points reduce the median deviation of log colours from their point's
-    # median, measured on the other half; NaN: too few points, or no deviation
+    # median on the other half; NaN: too few points, or no deviation
     explained: float
 
 
 @torch.no_grad()
 def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> ExposureGains:
-    """Estimate the photographs' gains from their colours at the points. `points`: [M, 3] world positions. `views`: V
-    photographs at full size, each read once; masked and transparent pixels are ignored. `near`: near plane, camera
-    z."""
+    """Estimate the gains of V photographs, `views` at full size, from their colours at points [M, 3], world positions,
+    without masked and transparent pixels. `near`: near plane, camera z."""
     order = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:HIDING]
     points = points.detach()[order.to(points.device)]
     count = min(len(points), POINTS, max(1, OBSERVATIONS // max(1, len(views))))
@@ -57,7 +56,7 @@ def estimate_gains(points: Tensor, views: Sequence[View], near: float) -> Exposu
 
 
 def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
-    """Read the log colours [count, 3] of a view at the first `count` points; NaN if occluded by any of the points,
+    """Read the log colours [count, 3] of a view at the first `count` points; NaN where occluded by any of the points,
     masked, transparent or out of range."""
     camera = view.camera.to(points.device)
     x, y, z, inside = camera.project(points, near)
@@ -83,7 +82,7 @@ def _log_colors(view: View, points: Tensor, count: int, near: float) -> Tensor:
 
 
 def _pixels(image: Tensor, camera: Camera, x: Tensor, y: Tensor) -> Tensor:
-    """Read the pixels [P, ...] of an image [H, W, ...] at P positions of a camera, whose image size may differ."""
+    """Read the pixels [P, ...] of an image at P positions of a camera, whose image size may differ."""
     row, column = (
         (position.nan_to_num(0.0) * size / full).long().clamp(0, size - 1).to(image.device)
         for position, size, full in zip((y, x), image.shape[:2], (camera.height, camera.width), strict=True)
@@ -110,9 +109,8 @@ def _disagreement(logs: Tensor) -> float:
 
 
 def _median(values: Tensor, dim: int) -> Tensor:
-    """Compute the median along a dimension without NaN, the mean of the middle two for even counts; NaN if empty.
-
-    torch's lower median would overestimate differences between photographs for even counts."""
+    """Compute the median along a dimension without NaN; NaN if empty. For even counts the mean of the middle two:
+    torch's lower median would overestimate differences between photographs."""
     if values.shape[dim] == 0:
         return torch.full_like(values.sum(dim), math.nan)
     return 0.5 * (values.nanmedian(dim).values - (-values).nanmedian(dim).values)

@@ -21,8 +21,8 @@ from .views import View
 
 MAX_SCALE = 0.25
 """Largest initial scale, as a fraction of the larger of scene extent and distance to the nearest camera."""
-PIXELS_PER_FIRST_SURFEL = 1000  # minimum number of pixels rendered in a run per initial surfel
-FEWEST_FIRST = 5000  # lower bound of the limit on initial surfels, in runs of any length
+PIXELS_PER_FIRST_SURFEL = 1000  # pixels rendered in a run per initial surfel, at least
+FEWEST_FIRST = 5000  # initial surfels that runs of any length may have
 MIN_SCALE = 1e-6  # smallest initial scale, as a fraction of the scene extent
 
 
@@ -39,8 +39,8 @@ class PointReport:
 
 
 def limit_first_surfels(config: TrainConfig, steps: int, pixels: int, views: int) -> TrainConfig:
-    """Set `first_surfels` by the length of the run, unless the options set it. `pixels`: total over all training views
-    at full size."""
+    """Set `first_surfels` by the length of the run, unless given. `pixels`: total of `views` training views at full
+    size."""
     if config.first_surfels is not None or not views:
         return config
     return replace(config, first_surfels=max(FEWEST_FIRST, int(steps * pixels / views / PIXELS_PER_FIRST_SURFEL)))
@@ -53,9 +53,8 @@ def _finite(positions: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def scene_extent(camera_centers: Tensor, points: Tensor | None = None) -> float:
-    """Compute 1.1 times the largest distance of the training cameras from their mean, in world units. `camera_centers`:
-    [C, 3]. `points`: [M, 3]. If all cameras are at one position, the extent is the median distance of the finite points
-    from it, and 1 without points."""
+    """Compute 1.1 times the largest distance of training cameras [C, 3] from their mean, world units. If all are at one
+    position: the median distance of the finite points [M, 3] from it, and 1 without points."""
     centers = _finite(camera_centers, torch.float64)
     middle = centers.mean(0) if len(centers) else torch.zeros(3, dtype=torch.float64)
     reach = float((centers - middle).norm(dim=-1).max()) if len(centers) else 0.0
@@ -77,21 +76,21 @@ def surfels_from_points(
 ) -> tuple[dict[str, Tensor], PointReport]:
     """Initialise surfel parameters from sparse points.
 
-    Each point becomes one surfel: scale = root mean square distance to its 3 nearest neighbours, normal towards the
-    nearest camera with a random in-plane rotation, the point's colour from every direction. Non-finite and duplicate
-    points are dropped and counted. Without a usable point, `config.random_points` surfels are sampled in `box`. If
-    there are more points than `config.densify.max_surfels` or `config.first_surfels`, a random subset is used.
-    Background points are appended as far as `config.background_points` and `config.densify.max_surfels` allow.
+    A surfel has scale `neighbour_distance`, its normal towards the nearest camera, a random in-plane rotation, and its
+    point's colour from every direction. Points that are duplicate or not finite are dropped. Without a usable point,
+    `config.random_points` surfels are sampled in `box`. Of more points than `config.densify.max_surfels` or
+    `config.first_surfels` a random subset is used. Background points are appended as far as `config.background_points`
+    and `config.densify.max_surfels` allow.
 
     Args:
         xyz: [M, 3] world positions; M may be 0.
-        rgb: [M, 3] colours in [0, 1]; non-finite values become grey.
-        camera_centers: [C, 3] world positions of the training cameras; without cameras, orientations are random.
-        box: [2, 3] lower and upper corner for random surfels; default: the cube of the scene extent about the cameras.
-        background: points in parts of the photographs that no point of `xyz` projects to.
+        rgb: [M, 3] colours in [0, 1]; grey where not finite.
+        camera_centers: [C, 3] world positions; without cameras, orientations are random.
+        box: [2, 3] corners for random surfels; default: the cube of the scene extent about the cameras.
+        background: as of `background_points`.
 
     Returns:
-        The parameters by name, float32, on the CPU (table in docs/overview.md), and the counts of points.
+        Parameters by name, float32, on the CPU (docs/overview.md), and counts of points.
 
     Raises:
         ValueError: `xyz` and `rgb` differ in length.
@@ -138,8 +137,8 @@ def surfels_from_points(
 
 
 def neighbour_distance(xyz: Tensor, extent: float) -> Tensor:
-    """Compute the root mean square distance [M] of each point to its 3 nearest neighbours, or fewer if there are fewer;
-    a hundredth of the extent for a single point."""
+    """Compute the root mean square distance [M] of each point to its nearest neighbours, at most 3; a hundredth of the
+    extent for a single point."""
     from scipy.spatial import cKDTree  # slow to import
 
     k = min(3, len(xyz) - 1)
@@ -183,7 +182,7 @@ def _nearest_camera(xyz: Tensor, centers: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
-    """Compute quaternions [M, 4] whose normals point along `to_camera` [M, 3], in a random direction if that is 0."""
+    """Compute quaternions [M, 4] of surfels with normals along `to_camera` [M, 3], random if that is 0."""
     n = len(to_camera)
     angles = 2.0 * math.pi * torch.rand(n, generator=generator)
     fallback = torch.nn.functional.normalize(torch.randn(n, 3, generator=generator), dim=-1)
@@ -193,8 +192,8 @@ def _orientation(to_camera: Tensor, generator: torch.Generator) -> Tensor:
 
 
 def quat_from_normal(normals: Tensor, angles: Tensor) -> Tensor:
-    """Compute unit quaternions [N, 4] that rotate about z by an angle and then take the z axis to a normal. `normals`:
-    [N, 3] unit vectors. `angles`: [N] in radians."""
+    """Compute unit quaternions [N, 4] that rotate about z by angles [N], radians, and then take z to unit normals
+    [N, 3]."""
     x, y, z = normals.unbind(-1)
     zero = torch.zeros_like(x)
     tilt = torch.stack([1.0 + z, -y, x, zero], -1)  # shortest rotation from (0, 0, 1); vanishes at -z
@@ -204,15 +203,15 @@ def quat_from_normal(normals: Tensor, angles: Tensor) -> Tensor:
 
 
 def rotate_in_plane(quats: Tensor, angles: Tensor) -> Tensor:
-    """Rotate surfels in their planes: quaternions [N, 4] by angles [N] in radians, from first to second tangent."""
+    """Rotate surfels [N, 4] in their planes by angles [N], radians, from first to second tangent."""
     w, x, y, z = quats.unbind(-1)
     cos, sin = torch.cos(angles / 2), torch.sin(angles / 2)
     return torch.stack([w * cos - z * sin, x * cos + y * sin, y * cos - x * sin, z * cos + w * sin], -1)
 
 
 def tangents(quats: Tensor) -> Tensor:
-    """Compute the tangents of surfels, the first two columns of their rotation matrices. `quats`: [N, 4], not
-    normalised; zero means no rotation. Returns [N, 3, 2] unit vectors; [..., 0] is the u axis, [..., 1] the v axis."""
+    """Compute the tangents u, v of surfels, [N, 3, 2] unit vectors: the first two columns of their rotation matrices.
+    `quats`: [N, 4] of any length; zero: no rotation."""
     norm = quats.norm(dim=-1, keepdim=True)
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
     w, x, y, z = torch.where(norm > 0, quats / norm.clamp(min=torch.finfo(quats.dtype).tiny), identity).unbind(-1)
@@ -233,14 +232,13 @@ def build_scene(
     declared: Tensor | None = None,
     background: BackgroundPoints | None = None,
 ) -> tuple[Scene, PointReport]:
-    """Build the initial scene on the CPU: surfels at the points, or at random in the box, and an untrained field.
+    """Build the initial scene on the CPU: surfels (`surfels_from_points`) and an untrained field.
 
     Args:
-        points, colors, camera_centers, box, background: as in `surfels_from_points`.
         bounded: the scene has no background (images with alpha): contraction "auto" is then off, as with a small
             `declared` box.
-        image_pixels: total over all training images; default for the size of the hash table.
-        declared: [2, 3] corners of the scene box that the capture states, if any.
+        image_pixels: total over all training images, for the size of the hash table.
+        declared: [2, 3] corners of the scene box that the capture states.
 
     Raises:
         ValueError: an option is out of range.
@@ -248,12 +246,11 @@ def build_scene(
     check_ranges(scene_config)
     check_ranges(train_config)
     surfels, report = surfels_from_points(points, colors, camera_centers, train_config, scene_config, box, background)
-    means = surfels["means"][: len(surfels["means"]) - report.background]  # background would make the field coarse
+    means = surfels["means"][: len(surfels["means"]) - report.background]  # others would make the field coarse
     near = NEAR * scene_extent(camera_centers, means)
     if scene_config.texture != "hash":  # texels are added once the geometry has settled
         return Scene(scene_config, surfels, None, near), report
-    if declared is not None:  # over a large box (open scenes) a grid would be coarser than over contracted space,
-        # which is twice as wide as the cameras' ball
+    if declared is not None:  # over a larger box a grid would be coarser than over contracted space
         bounded |= float((declared[1] - declared[0]).max()) <= 4 * scene_extent(camera_centers)
     contract = scene_config.contraction == "on" or (scene_config.contraction == "auto" and not bounded)
     mid, half = field_domain(means if declared is None else declared, camera_centers, contract)
@@ -273,8 +270,8 @@ def scene_for_views(
     train_config: TrainConfig,
     steps: int | None = None,
 ) -> Scene:
-    """Build the initial scene for photographs in memory, at full size, and points, see `build_scene`. `steps`: length
-    of the run, which limits the number of points; None: no limit."""
+    """Build the initial scene for views at full size and points, see `build_scene`. `steps`: length of the run, which
+    limits the number of points; None: no limit."""
     centers = torch.stack([view.camera.center.cpu() for view in views]) if views else torch.zeros(0, 3)
     pixels = sum(view.camera.width * view.camera.height for view in views)
     bounded = any(view.image.shape[-1] == 4 for view in views)
@@ -287,7 +284,7 @@ def scene_for_views(
 
 def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple[tuple[float, float, float], float]:
     """Compute centre and half size of the field's domain, world units: with contraction of the ball around all cameras
-    (`scene_extent`), without of a cube around `means` (initial surfels, or corners of a box), a tenth larger."""
+    (`scene_extent`), without of a cube a tenth larger than the box of `means`."""
     if contract and len(camera_centers):
         x, y, z = camera_centers.detach().float().cpu().mean(0).tolist()
         return (x, y, z), scene_extent(camera_centers, means)
@@ -297,8 +294,7 @@ def field_domain(means: Tensor, camera_centers: Tensor, contract: bool) -> tuple
 
 
 def default_table_size(image_pixels: int) -> int:
-    """Choose log2 of the entries per hash level by the photographs, at most 17 so that the table fits into a cache:
-    four levels of 2^17 entries are 8 MB in float32."""
+    """Choose log2 of the entries per hash level, at most 17: four such levels, 8 MB, fit into a cache."""
     return min(17, max(14, table_size_of(image_pixels)))
 
 

@@ -1,4 +1,4 @@
-"""Measure the memory that is left for a scene to grow into, near whose end surfels and texels stop growing."""
+"""Memory that is left for surfels and texels to grow into."""
 
 from __future__ import annotations
 
@@ -10,24 +10,25 @@ from bitymi_ns.ops.capacity import free_memory
 from .processes import Processes
 
 FILLED = 0.75
-"""Fraction of the memory beyond which nothing grows. Copies while surfels are replaced, freed blocks that are kept for
-the next view, and other programs have the rest."""
-PER_SURFEL = 3000  # bytes: parameters, gradients, Adam's averages, two states to go back to, copies of a densification
-PER_TEXEL = 44  # bytes: colour, alpha and its gradient, share, and two states with colours in half precision
-PER_TEXEL_SUM = 12  # bytes more on a GPU: the gradient of colours, which the CPU adds tile by tile
-PER_PIXEL = 400  # bytes of a view: pictures, gradients and maps, and the ten views of multi-view scores
-PER_FRAGMENT = 36  # bytes: list, gradients of weights and coordinates, order of the backward pass
+"""Fraction of the memory beyond which nothing grows; the rest is for copies while surfels are replaced, cached blocks
+and other programs."""
+# bytes of
+PER_SURFEL = 3000  # parameters, gradients, Adam's averages, two states to go back to, copies of a densification
+PER_TEXEL = 44  # colour, alpha and its gradient, share, and two states with colours in half precision
+PER_TEXEL_SUM = 12  # gradients of colours on a GPU; the CPU adds them tile by tile
+PER_PIXEL = 400  # pictures, gradients and maps of a view, and the ten views of multi-view scores
+PER_FRAGMENT = 36  # list, gradients of weights and coordinates, order of the backward pass
 FRAGMENTS = 45  # fragments per pixel of a view; 28 to 45 were measured
 
 
 def available_memory(used: float) -> float:
-    """Return the bytes that processes which use `used` bytes may have in all, within the limit of a control group."""
+    """Return the bytes that processes which use `used` may have in all, within the limit of a control group."""
     return min(psutil.virtual_memory().available + used, memory_limit())
 
 
 def room_to_grow(device: torch.device, processes: Processes) -> float:
-    """Return the bytes that a process may take beyond those in use, the same in all processes of a run; below 0 if too
-    many are in use. Every process calls it."""
+    """Return the bytes that a process may still take, below 0 if too many are in use; the same in all processes of a
+    run, each of which calls it."""
     if device.type == "cuda":
         left = free_memory(device) - (1.0 - FILLED) * torch.cuda.mem_get_info(device)[1]
     else:

@@ -1,4 +1,4 @@
-"""Messages about the limits that a run hits, and about options that differ from the recorded ones."""
+"""Messages about limits of a run, and options that differ from the recorded ones."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from .schedules import Schedule
 
 
 def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int = 1) -> list[str]:
-    """Describe the short-run rules in force, and warn if the run ends before it has seen every photograph. `at_once`:
-    views rendered per step."""
+    """Describe the short-run rules in force, and warn if the run does not see every photograph. `at_once`: views per
+    step."""
     said = []
     if schedule.short_run_gain > 1.0:
         parts = [f"surfels learn {schedule.short_run_gain:.1f} times as fast"]
@@ -30,15 +30,14 @@ def short_run(schedule: Schedule, views: int, field: bool = True, at_once: int =
     seen = schedule.max_steps * at_once
     if seen < views:
         said.append(
-            f"A run of {schedule.max_steps:,} steps sees {seen:,} of the {views:,} training photographs, each once. "
-            "Train for longer with --max-num-iterations."
+            f"A run of {schedule.max_steps:,} steps sees {seen:,} of the {views:,} training photographs: raise "
+            "--max-num-iterations."
         )
     return said
 
 
 def warnings_at_start(points: PointReport, config: TrainConfig, image_pixels: int, scene: SceneConfig) -> list[str]:
-    """Describe the limits that the initial scene hits. `points`: counts of the sparse points used and dropped.
-    `image_pixels`: total over all training images."""
+    """Describe the limits that the initial scene hits. `image_pixels`: total over all training images."""
     said = []
     if points.over_cap:
         most, first = config.densify.max_surfels, config.first_surfels
@@ -51,18 +50,18 @@ def warnings_at_start(points: PointReport, config: TrainConfig, image_pixels: in
     size = default_table_size(image_pixels)
     if scene.texture == "hash" and scene.log2_table_size is None and table_size_of(image_pixels) > size:
         said.append(
-            f"The texture field gets 2^{size} entries per level, the most that is chosen by itself; the photographs "
-            f"could fill 2^{table_size_of(image_pixels)} (--pipeline.model.scene.log2-table-size)."
+            f"The texture field gets 2^{size} entries per level, the default's maximum; the photographs could fill "
+            f"2^{table_size_of(image_pixels)} (--pipeline.model.scene.log2-table-size)."
         )
     return said
 
 
 def held_back(count: int, most: int, config: TrainConfig) -> str:
-    """Report that densification wanted `count` surfels beyond the limit `most`."""
+    """Report that densification wanted `count` surfels more than the limit `most`."""
     densify = config.densify
     return (
         f"Densification stops at {most:,} surfels, one for {densify.pixels_per_surfel:g} pixels of all photographs or "
-        f"{densify.growth:g} times the first, and would have made {count:,} more now (--max-surfels, "
+        f"{densify.growth:g} times the first, and would have made {count:,} more (--max-surfels, "
         "--pipeline.model.train.densify.pixels-per-surfel, growth)."
     )
 
@@ -70,8 +69,8 @@ def held_back(count: int, most: int, config: TrainConfig) -> str:
 def memory_reached(what: str, most: int) -> str:
     """Report that memory has stopped the growth of `what` ("Surfels") at a number of them."""
     return (
-        f"{what} stop growing at {most:,}, as {FILLED:.0%} of the memory is used up; the run goes on. To have more of "
-        "them, end other programs or train smaller photographs (--pipeline.datamanager.longest-side)."
+        f"{what} stop growing at {most:,}, as {FILLED:.0%} of the memory is used up; the run goes on. For more, end "
+        "other programs or train smaller photographs (--pipeline.datamanager.longest-side)."
     )
 
 
@@ -84,8 +83,8 @@ NEW = "new in this version"
 
 
 def other_options(record: str | None, config: TrainConfig) -> list[str]:
-    """List the options of a resumed run that differ from the recorded ones. `record`: result of `recorded`; None: a
-    checkpoint of an earlier version, without a record. `config`: options of the resumed run."""
+    """List the options `config` of a resumed run that differ from the recorded ones. `record`: of `recorded`; None in
+    checkpoints of earlier versions."""
     if record is None:
         return []
     before, now = (dict(_flat(json.loads(text))) for text in (record, recorded(config)))

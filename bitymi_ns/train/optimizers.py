@@ -18,9 +18,10 @@ from bitymi_ns.scene.field import HashField
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
-EPS = 1e-15  # Adam's epsilon
-BETAS = (0.9, 0.999)  # Adam's betas of surfel parameters
-FIELD_BETAS = (0.9, 0.99)  # those of the texture field, whose gradients are sparse, and large early on
+# of Adam
+EPS = 1e-15
+BETAS = (0.9, 0.999)
+FIELD_BETAS = (0.9, 0.99)  # of the texture field, whose gradients are sparse, and large early on
 
 
 def adam(parameters: Sequence[Tensor], betas: tuple[float, float] = BETAS, rate: float = 0.0, eps: float = EPS) -> Adam:
@@ -55,11 +56,9 @@ PLAIN = {"fused": True, "weight_decay": 0.0, "amsgrad": False, "maximize": False
 
 @torch.no_grad()
 def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> None:
-    """Step all optimisers, as calling each one's `step` would, and scale the updates row by row.
+    """Step all optimisers, by parameter group, and scale the updates of parameters [N, ...] by row factors [N].
 
-    Each Adam.step costs 100-200 us of Python, ten times the GPU work, so on a CUDA device one kernel steps all fused
-    Adam optimisers. `optimizers`: by parameter group. `factors`: row factors [N] of the updates of parameters [N, ...],
-    by parameter group."""
+    Adam.step costs 100-200 us of Python, ten times the GPU work: on a CUDA device one kernel steps all fused Adams."""
     fused: list[dict[str, Any]] = []
     for name, optimizer in optimizers.items():
         arguments = _kernel_arguments(optimizer, factors.get(name))
@@ -78,8 +77,8 @@ def step(optimizers: Mapping[str, Optimizer], factors: Mapping[str, Tensor]) -> 
 
 
 def _kernel_arguments(optimizer: Optimizer, factors: Tensor | None) -> list[dict[str, Any]] | None:
-    """Build the kernel's arguments for the parameters with a gradient; None if the optimiser must step itself, because
-    it is on the CPU, no plain fused Adam, or has no state yet."""
+    """Build the kernel's arguments for the parameters with a gradient; None for optimisers on the CPU, other than plain
+    fused Adam, or without state."""
     if type(optimizer) is not Adam or not cuda_backend(optimizer.param_groups[0]["params"][0].device):
         return None
     arguments = []
@@ -111,20 +110,18 @@ def _kernel_arguments(optimizer: Optimizer, factors: Tensor | None) -> list[dict
 
 
 def set_rate(optimizer: Optimizer, rate: float) -> None:
-    """Set the learning rate of an optimiser."""
     for group in optimizer.param_groups:
         group["lr"] = rate
 
 
 def forget_gradients(optimizers: Iterable[Optimizer]) -> None:
-    """Set the gradients of all parameters to None."""
     for optimizer in optimizers:
         for group in optimizer.param_groups:
             for parameter in group["params"]:
                 parameter.grad = None
 
 
-ResizeHook = Callable[[str, Parameter], None]  # called with the name and the new Parameter when one is replaced
+ResizeHook = Callable[[str, Parameter], None]  # called with name and new Parameter when one is replaced
 
 
 @torch.no_grad()
@@ -135,11 +132,10 @@ def replace_rows(
     new: Mapping[str, Tensor] | None = None,
     on_resize: ResizeHook | None = None,
 ) -> None:
-    """Keep the rows `keep` [n] int64 of every surfel parameter [N, ...], in that order, and append the rows `new`
-    [m, ...], by name; None: none.
+    """Keep the rows `keep` [n] int64 of every surfel parameter [N, ...], in that order, and append rows `new` [m, ...].
 
-    Every entry of `surfels` becomes a new Parameter, also in its optimiser (one group of that one parameter; some may
-    be missing), and `on_resize` is called for it. Kept rows keep their optimiser state; that of new rows is zero."""
+    Every entry of `surfels` becomes a new Parameter, also in its optimiser, if it has one, and `on_resize` is called.
+    Kept rows keep their optimiser state; that of new rows is zero."""
     for name in list(surfels.keys()):
         old = surfels[name]
         added = 0 if new is None else len(new[name])
@@ -163,8 +159,8 @@ def replace_rows(
 def cap_opacity(
     surfels: ParameterDict, optimizers: Mapping[str, Optimizer], highest: float, forget_all: bool = False
 ) -> int:
-    """Clamp opacities to at most `highest`, in place, and reset the optimiser state of those lowered, or of all rows,
-    as the old momentum would raise them again at once. Returns the number of opacities lowered."""
+    """Clamp opacities to `highest`, in place, and reset the optimiser state of those lowered, or of all: the old
+    momentum would raise them again at once. Returns the number lowered."""
     logits = surfels["opacity_logits"]
     limit = torch.logit(torch.tensor(highest, dtype=torch.float64)).item()
     above = logits > limit

@@ -1,18 +1,18 @@
 """Refinement of the training poses together with the scene.
 
-A photograph's pose takes a Gauss-Newton step whenever it is rendered. The gradient is that of the loss with respect to
-rigid motions (`ops.project`). The curvature comes from the surfels: the L1 loss rises with the absolute gradient a_i of
-each projected centre and levels off within about a pixel. With the Jacobian J_i [2, 6] of the centre in pixels,
+A photograph's pose takes a Gauss-Newton step whenever it is rendered, with the gradient with respect to rigid motions
+(`ops.project`). The L1 loss rises with the absolute gradient a_i of each projected centre and levels off within about a
+pixel, which gives the curvature. With the Jacobian J_i [2, 6] of the centre in pixels,
 
     step = -pixels (sum J_i^T a_i J_i)^-1 gradient
 
-moves the image by `pixels` if all fragments agree on the direction, and by less if they do not.
+moves the image by `pixels` if all fragments agree on the direction, else by less.
 
-A common similarity of all cameras (rotation, translation, scale of the world) changes no image once the scene follows.
-It is projected out of every step, so that the scene stays in the capture's frame.
+A common similarity of all cameras changes no image once the scene follows. It is projected out of every step, so that
+the scene stays in the capture's frame.
 
-Pose errors from structure from motion are smooth: neighbouring photographs share them. Cameras without a training
-photograph therefore get the corrections of the nearest photographs.
+Neighbouring photographs share the pose errors of structure from motion: cameras without a training photograph get the
+corrections of the nearest ones.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
 DAMPING = 0.01  # added to the curvature's diagonal, relative to it
 NEIGHBOURS = 4  # photographs whose corrections are averaged for another camera
-TRIES = 10  # maximum number of renders to align a view
-FIRST, SHORTEST = 0.7, 0.02  # first step of an alignment and the step length that ends it, pixels
+TRIES = 10  # renders to align a view
+FIRST, SHORTEST = 0.7, 0.02  # first step of an alignment, and the one that ends it, pixels
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
@@ -49,9 +49,8 @@ def cross_matrix(vector: Tensor) -> Tensor:
 
 
 def moved(viewmat: Tensor, motion: Tensor) -> Tensor:
-    """Apply a rigid motion to a camera pose. `viewmat`: [4, 4] float64, world to camera. `motion`: [6] float64:
-    rotation vector about the camera centre and translation of it, both in world axes. Returns [4, 4] float64,
-    differentiable in the motion."""
+    """Apply a rigid motion to a pose [4, 4] float64, world to camera, differentiably. `motion`: [6] float64, rotation
+    vector about the camera centre and translation, in world axes."""
     rotation = viewmat[:3, :3] @ torch.linalg.matrix_exp(-cross_matrix(motion[:3]))
     center = -viewmat[:3, :3].T @ viewmat[:3, 3] + motion[3:]
     top = torch.cat([rotation, -(rotation @ center)[:, None]], 1)
@@ -62,8 +61,8 @@ def pose_step(gradient: Tensor, projection: Projection, pixels: float) -> Tensor
     """Compute the Gauss-Newton step of a camera after the backward pass of a loss.
 
     Args:
-        gradient: [6] float64 of the loss with respect to a motion as in `moved`.
-        projection: projection of the view, after the backward pass.
+        gradient: [6] float64, of the loss with respect to the motion (`moved`).
+        projection: of the view.
         pixels: image motion if all fragments agree on the direction.
 
     Returns:
@@ -101,11 +100,11 @@ class Poses:
     """Pose corrections of the training photographs.
 
     Attributes:
-        motions: [V, 6] float64 on the CPU, motion of each camera, see `moved`; None: poses are not refined.
+        motions: [V, 6] float64 on the CPU, of each camera (`moved`); None: poses are not refined.
     """
 
     def __init__(self, schedule: Schedule, cameras: Sequence[Camera]) -> None:
-        """`cameras`: training cameras at full size, with the poses of the capture."""
+        """`cameras`: training cameras, with the poses of the capture."""
         self.schedule = schedule
         self.motions: Tensor | None = None
         self._cameras = cameras
@@ -124,11 +123,11 @@ class Poses:
 
     @property
     def refined(self) -> bool:
-        """True if the poses are refined in this run or were before it was resumed."""
+        """True if poses are refined, or were before the run was resumed."""
         return self.motions is not None
 
     def begin(self) -> None:
-        """Discard cameras that `learning` returned in an unfinished step."""
+        """Discard what `learning` returned in an unfinished step."""
         self._learning = []
 
     def of(self, index: int, camera: Camera) -> Camera:
@@ -138,7 +137,7 @@ class Poses:
         return camera.posed(moved(self._given[index], self.motions[index]))
 
     def learning(self, index: int, camera: Camera, step: int) -> Camera:
-        """Return the camera of a training view for a step; its pose gets a gradient in steps that refine poses."""
+        """Return the camera of a training view for a step; its pose gets a gradient if the step refines poses."""
         if self.motions is None or self.schedule.pose_pixels(step) == 0.0:
             return self.of(index, camera)
         motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)
@@ -147,8 +146,8 @@ class Poses:
 
     @torch.no_grad()
     def step(self, projections: Sequence[Projection], pixels: float, processes: Processes) -> None:
-        """Update the poses of a step's views, after the backward passes. `projections`: one per view, in the order of
-        the calls of `learning`. `pixels`: see `pose_step`."""
+        """Update the poses of a step's views, after the backward passes. `projections`: in the order of `learning`.
+        `pixels`: see `pose_step`."""
         learning, self._learning = self._learning, []
         if self.motions is None or pixels == 0.0:
             return
@@ -172,7 +171,7 @@ class Poses:
         return {"motions": self.motions}
 
     def load_state_dict(self, state: Mapping[str, Any] | None) -> None:
-        """Restore what `state_dict` returned, also if this run refines poses no further; not for another number of
+        """Restore what `state_dict` returned, also in a run that does not refine poses; not for another number of
         photographs. `state`: None: a checkpoint from before poses were refined."""
         motions = None if state is None else state["motions"]
         if motions is not None and len(motions) == len(self._cameras):
@@ -180,7 +179,7 @@ class Poses:
 
 
 def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
-    """Correct a camera of the capture by the weighted mean motion of the nearest photographs, by distance and
+    """Correct a camera of the capture by the mean motion of the nearest photographs, weighted by distance and
     direction. `given`, `motions`: [V, 4, 4] float64 poses in the capture, and [V, 6] their corrections (`moved`)."""
     viewmat = camera.viewmat.double().cpu()
     centers = -(given[:, :3, :3] * given[:, :3, 3:]).sum(1)
@@ -193,8 +192,8 @@ def carried(camera: Camera, given: Tensor, motions: Tensor) -> Camera:
 
 
 def gauge(centers: Tensor, extent: float) -> Tensor:
-    """Compute an orthonormal basis [V * 6, D] of the similarities of all cameras: rotations, translations, scale.
-    `centers`: [V, 3] float64 world positions of the cameras. `extent`: unit of length of translations."""
+    """Compute an orthonormal basis [V * 6, D] of the similarities of all cameras. `centers`: [V, 3] float64, world.
+    `extent`: unit of length of translations."""
     arms = (centers - centers.mean(0)) / extent
     rows = torch.zeros(7, len(centers), 6, dtype=torch.float64)
     for axis in range(3):
@@ -210,15 +209,15 @@ def gauge(centers: Tensor, extent: float) -> Tensor:
 
 @torch.no_grad()
 def view_psnr(scene: Scene, view: View, background: Tensor | None) -> float:
-    """Compute the PSNR, in dB, of a scene over a background against a photograph on the scene's device."""
+    """Compute the PSNR, dB, of a scene over a background against a photograph on its device."""
     _, rgb, target = view.drawn(scene, background)
     return psnr(rgb.clamp(0.0, 1.0), target, view.mask)
 
 
 @torch.enable_grad()
 def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: float) -> Camera:
-    """Align a camera to a fixed scene: minimise the photometric loss against its photograph from the given pose.
-    `view`: on the scene's device, at full size. `background`: [3] colour behind the scene; None: black."""
+    """Align a camera to a fixed scene by the photometric loss. `view`: on the scene's device, at full size.
+    `background`: [3]; None: black."""
 
     def judge(viewmat: Tensor) -> tuple[float, Tensor, Projection]:
         motion = torch.zeros(6, dtype=torch.float64, requires_grad=True)

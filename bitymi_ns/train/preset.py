@@ -1,7 +1,4 @@
-"""Presets: the YAML files of method_configs/ as validated dataclasses.
-
-Defaults are declared in the dataclasses; a file states only its differences.
-"""
+"""Presets: YAML files of method_configs/, which state differences from the defaults of the dataclasses."""
 
 import json
 import re
@@ -19,11 +16,11 @@ from .config import TrainConfig
 
 
 class PresetError(ValueError):
-    """Invalid preset file; the message names the file and the key."""
+    """Invalid preset file; names file and key."""
 
 
 class Loader(yaml.SafeLoader):
-    """YAML loader that reads 1e-3 as a number; YAML 1.1 takes it for text, since it has no point."""
+    """YAML loader that reads 1e-3 as a number, not as text like YAML 1.1."""
 
 
 Loader.add_implicit_resolver(
@@ -44,13 +41,13 @@ class Preset:
 
 
 def load_preset(name: str, folder: Path | None = None) -> Preset:
-    """Read the preset `name` from `folder` (default: the installed presets). Raises PresetError: the file is missing or
-    is not a valid preset."""
+    """Read the preset `name` from `folder`; None: the installed presets. Raises PresetError: it is missing or
+    invalid."""
     folder = preset_dir() if folder is None else folder
     path = folder / f"{name}.yaml"
     values = _read_with_base(path, folder, ())
     try:
-        # strict validation as JSON accepts lists for tuples, but neither true for a number nor 3 for a string
+        # strictly: as JSON, lists become tuples, but neither true a number nor 3 a string
         return TypeAdapter(Preset).validate_json(json.dumps({**values, "name": name}, default=str), strict=True)
     except ValidationError as error:
         first = error.errors()[0]

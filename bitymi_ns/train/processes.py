@@ -1,8 +1,7 @@
-"""Communication between the processes of a run, each of which renders its own views.
+"""Communication between the processes of a run, each of which renders its own views of a copy of the scene.
 
-Every process holds the whole scene and makes all decisions itself, from inputs that are made equal here: sums over all
-processes, or values broadcast from the first. Uses torch.distributed's default group with gloo for CPU tensors and nccl
-for CUDA tensors.
+All make the same decisions, from inputs that are made equal here: sums, or values broadcast from the first process.
+Uses torch.distributed's default group, with gloo for CPU tensors and nccl for CUDA tensors.
 """
 
 from __future__ import annotations
@@ -32,15 +31,15 @@ class ProcessesApart(RuntimeError):
 
 @dataclass(frozen=True)
 class Processes:
-    """Process group of a run. With a single process every method is a no-op."""
+    """Process group of a run; methods of a single process do nothing."""
 
-    rank: int = 0  # of this process; only rank 0 writes and prints
-    count: int = 1  # number of processes
+    rank: int = 0  # of this process
+    count: int = 1  # of processes
     each: int = 1  # views that a process renders per step, one after the other
 
     @classmethod
     def joined(cls, each: int = 1) -> Processes:
-        """Wrap torch.distributed's default group, or a single process if there is none."""
+        """Return torch.distributed's default group, or a single process."""
         if not (dist.is_available() and dist.is_initialized()):
             return cls(each=each)
         return cls(dist.get_rank(), dist.get_world_size(), each)
@@ -56,18 +55,17 @@ class Processes:
         return self.count * self.each
 
     def view_numbers(self, step: int) -> range:
-        """Compute the positions in the training order of this process's views in a step."""
+        """Compute the positions of this process's views in the training order."""
         start = step * self.views + self.rank * self.each
         return range(start, start + self.each)
 
     # inputs of decisions, made equal in all processes
 
     def any(self, condition: bool) -> bool:
-        """Return True if the condition holds in any process."""
         return bool(self._largest([int(condition)])[0])
 
     def first_error(self, own: str | None) -> str | None:
-        """Return the first problem reported by any process, by rank; None if there is none."""
+        """Return the first problem of any process, by rank; None without any."""
         if self.count == 1 or not self.any(own is not None):
             return own
         problems: list[str | None] = [None] * self.count
@@ -82,7 +80,7 @@ class Processes:
         return float(total) / self.count
 
     def from_first(self, state: Any, device: torch.device | str) -> Any:
-        """Broadcast a state (tensors, numbers, strings) of rank 0 to a device; other ranks may pass None."""
+        """Broadcast a state (tensors, numbers, strings) of rank 0; other ranks may pass None."""
         if self.count == 1:
             return state
         packed = io.BytesIO()
@@ -104,7 +102,7 @@ class Processes:
     # sums
 
     def sum(self, *tensors: Tensor) -> None:
-        """Replace tensors by their sums over the processes, bit-identical in all; one buffer per dtype."""
+        """Replace tensors by their sums over the processes, bit-identical in all."""
         self._reduce(tensors, dist.ReduceOp.SUM)
 
     def maximum(self, tensor: Tensor) -> None:
@@ -113,13 +111,12 @@ class Processes:
 
     @torch.no_grad()
     def average_gradients(self, parameters: Sequence[Tensor], surfels: int) -> None:
-        """Replace gradients, summed over this process's views, by their means over all views of the step.
-
-        The gradient of a parameter stays None if it is None in all processes.
+        """Replace gradients, summed over this process's views, by their means over all views of the step; None stays if
+        all processes have it.
 
         Args:
             parameters: the same in all processes, with dense gradients.
-            surfels: number of surfels, compared between processes before gradients are added.
+            surfels: number of surfels, compared before gradients are added.
 
         Raises:
             ProcessesApart: the numbers of surfels differ.
@@ -129,7 +126,7 @@ class Processes:
         if most != -least:
             raise ProcessesApart(
                 f"the processes of the run have come apart: one has {most:,} surfels, another {-least:,}. Go on from "
-                "the newest checkpoint, with one process if it happens again, and please report it"
+                "the newest checkpoint, and report it; if it happens again, with one process"
             )
         gradients = []
         for parameter, there in zip(parameters, moved, strict=True):
@@ -176,8 +173,7 @@ def raise_process_lost() -> Iterator[None]:
 
 
 def leave(status: int) -> NoReturn:
-    """End this process at once after another was lost: threads of gloo that still wait for it may abort the interpreter
-    as it shuts down."""
+    """End this process at once after another was lost: threads of gloo that wait for it may abort the interpreter."""
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError, ValueError):
             stream.flush()

@@ -1,8 +1,8 @@
 """Rollback of diverged training to the last good state, with lower learning rates.
 
-Divergence is a loss that is not finite because of a parameter, a field or too many surfels that are not finite, or a
-window of steps whose mean photometric loss exceeds that of images of constant mean colour and that of the initial
-scene. Losses from an opacity reset until opacities have recovered do not count. The step count continues.
+Divergence is a field or too many surfels that are not finite, or a window of steps whose mean photometric loss exceeds
+that of images of constant mean colour and that of the initial scene. Losses from an opacity reset until opacities have
+recovered do not count. The step count continues.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from .poses import Poses
 from .strategy import Strategy, finite_rows
 from .views import DownscaledViews, step_background
 
-WORSE = 1.25  # ratio to the loss of blank images or of the initial scene above which an early window is bad; later 1
+WORSE = 1.25  # ratio to the limit of the loss above which an early window is bad; later 1
 EARLY, EARLY_STEPS = 0.1, 100  # fraction of the run, and minimum number of steps, in which surfels settle
-MOST_BROKEN = 0.01  # surfels that are not finite are dropped up to this fraction of all; beyond, the run rolls back
-COMPARED_VIEWS = 4  # views for the loss of blank images and of the initial scene
+MOST_BROKEN = 0.01  # fraction of surfels that are dropped if they are not finite; beyond, the run rolls back
+COMPARED_VIEWS = 4  # views for the limit of the loss
 
 
 class RollbackGuard:
-    """Rollback guard of a run; `factor` is that of all learning rates, 1 before the first of its `rollbacks`."""
+    """Rollback guard of a run; `factor` of all learning rates is 1 before the first of its `rollbacks`."""
 
     def __init__(self, strategy: Strategy, exposure: Exposure, poses: Poses, announce: Callable[[str], None]) -> None:
         self.scene, self.strategy, self.announce = strategy.scene, strategy, announce
@@ -44,24 +44,22 @@ class RollbackGuard:
         self.restart()
 
     def restart(self) -> None:
-        """Discard captured states and start a new window, when the scene's texture becomes texels."""
+        """Discard captured states and start a new window."""
         self._states: list[tuple[int, dict[str, Any]]] = []  # (step, state); the older one is known to be good
-        self._sum, self._count = 0.0, 0  # of losses; stays on their device to avoid synchronisation
+        self._sum, self._count = 0.0, 0  # of losses, on their device to avoid synchronisation
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a resumed run, without captured states: it cannot roll back to before it resumed."""
-        kept = {"factor": self.factor, "rollbacks": self.rollbacks, "limit": self._limit}
-        return kept | {"sum": float(self._sum), "count": self._count}
+        """Return the state for a resumed run, without captured states."""
+        losses = {"limit": self._limit, "sum": float(self._sum), "count": self._count}
+        return {"factor": self.factor, "rollbacks": self.rollbacks, **losses}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned."""
         self.restart()
         self.factor, self.rollbacks = float(state["factor"]), int(state["rollbacks"])
         self._limit, self._sum, self._count = float(state["limit"]), float(state["sum"]), int(state["count"])
 
     def before(self, step: int, views: DownscaledViews) -> None:
-        """Capture a state if there is none, and measure the loss of the initial scene and of blank images once; call it
-        before each step. `views`: training views."""
+        """Before each step, capture a state if there is none; measure the limit of the loss once."""
         if not self.options.rollbacks or self._states:
             return
         if math.isnan(self._limit):
@@ -71,11 +69,10 @@ class RollbackGuard:
     @torch.no_grad()
     def _loss_of(self, views: DownscaledViews) -> float:
         """Compute the mean loss of a few views at full size, of the scene or of images of their mean colour: the larger
-        one. Images too small for SSIM have smaller losses."""
+        one."""
         config, device, losses = self.strategy.config, self.scene.surfels["means"].device, []
         for i in spread(len(views), COMPARED_VIEWS):
             view = views.at(i, 1.0)
-            # as in training steps, but always the same colours if they are random
             _, rgb, target = view.drawn(self.scene, step_background(config, view, i, device))
             blank = target.mean((0, 1)).expand_as(target).contiguous()
             weight = config.loss.ssim_weight
@@ -83,13 +80,12 @@ class RollbackGuard:
         return max(self.strategy.processes.mean(float(loss)) for loss in torch.stack(losses).mean(0))
 
     def after(self, step: int, loss: Tensor) -> dict[str, float]:
-        """Check for divergence at the end of a window; call it after each step's optimisers and strategy. `loss`:
-        scalar, photometric loss of the step, detached. Returns and raises as `repair`."""
+        """After each step's optimisers and strategy, check for divergence if a window ends. `loss`: photometric, of the
+        step, detached. Returns and raises as `repair`."""
         if not self.options.rollbacks:
             return {}
-        self._sum, self._count = self._sum + loss, self._count + 1
-        if self.schedule.recovering(step):
-            self._sum, self._count = 0.0, 0
+        recovering = self.schedule.recovering(step)
+        self._sum, self._count = (0.0, 0) if recovering else (self._sum + loss, self._count + 1)
         steps_left = self.schedule.max_steps - 1 - step
         if steps_left % self.window:  # the last window ends with the run
             return {}
@@ -100,21 +96,21 @@ class RollbackGuard:
             return self._go_back(step, f"the views are drawn worse than blank ones (loss {mean:.3f})")
         if describe_broken(self.scene):
             return self.repair(step)
-        if steps_left and not mean > self._limit:  # a state that also passes the later, stricter test
+        if steps_left and not mean > self._limit:  # passes the later test, too
             self._states = self._states[-1:]  # frees the large old state before the next is captured
             self._states.append((step + 1, self._capture()))
         return {}
 
     def repair(self, step: int, error: TrainingDiverged | None = None) -> dict[str, float]:
-        """Drop surfels that are not finite; roll back if there are many, or if the field is broken. Returns counts by
+        """Drop surfels that are not finite; roll back if they are many, or the field is broken. Returns counts by
         action. Raises TrainingDiverged: the run cannot go back, or no parameter explains `error`."""
         cause = describe_broken(self.scene)
         if error is not None and not (self.options.rollbacks and cause):
             raise error
         broken = ~finite_rows(self.scene)
         dropped = float(broken.sum())
-        field_broken = self.scene.field is not None and describe_broken(self.scene.field)
-        if field_broken or dropped > MOST_BROKEN * len(self.scene):
+        field = self.scene.field
+        if dropped > MOST_BROKEN * len(self.scene) or (field is not None and describe_broken(field)):
             return self._go_back(step, cause)
         self.strategy.remove(broken)
         self.announce(f"step {step}: {dropped:.0f} surfels were no longer finite and were dropped")
@@ -122,38 +118,33 @@ class RollbackGuard:
 
     def _go_back(self, step: int, cause: str) -> dict[str, float]:
         if self.rollbacks >= self.options.rollbacks or not self._states:
-            tried = f" It went back {self.rollbacks} times, to learning rates times {self.factor:.2g}."
-            tried = tried if self.rollbacks else ""
-            raise TrainingDiverged(f"training diverged at step {step}: {cause}.{tried} Lower the learning rates")
+            tried = f" after {self.rollbacks} rollbacks (rates times {self.factor:.2g})" if self.rollbacks else ""
+            raise TrainingDiverged(f"training diverged at step {step}{tried}: {cause}. Lower the learning rates")
         origin, state = self._states[0]
         self.rollbacks, self.factor = self.rollbacks + 1, self.factor * self.options.rates
         self.restart()
         self._states = [(origin, state)]
-        self._restore(state)
+        # new Parameters: a live autograd graph relies on the shapes of the old ones
+        surfels = self.scene.surfels
+        scene, none = state["scene"], surfels["means"].new_zeros(0, dtype=torch.int64)
+        rows = {name: scene[f"surfels.{name}"] for name in surfels.keys()}
+        replace_rows(surfels, self.strategy.optimizers, none, rows, self.strategy.on_resize)
+        self.scene.resize_for_state(scene)
+        self.scene.load_state_dict(scene)
+        self.scene.zero_grad(set_to_none=True)
+        for name, part in self._parts.items():
+            part.load_state_dict(copy.deepcopy(state[name]))
         self.announce(
-            f"step {step}: training diverged ({cause}); back to the state before step {origin}, "
-            f"with learning rates times {self.factor:.2g} from here on"
+            f"step {step}: training diverged ({cause}); back to the state before step {origin}, with learning rates "
+            f"times {self.factor:.2g}"
         )
         return {"rolled_back": float(step - origin), "rates": self.factor, "surfels": float(len(self.scene))}
 
     def _capture(self) -> dict[str, Any]:
-        # texels dominate a state: their steady buffers are shared between states, and they are kept in half precision,
-        # whose error of 2^-11 of a residual is invisible
+        # texels dominate a state: steady buffers are shared between states, residuals kept in half precision
         steady = {f"field.{name}" for name in TexelField.STEADY}
         scene = {
             name: value if name in steady else value.half() if name == "field.texels" else value.clone()
             for name, value in self.scene.state_dict().items()
         }
         return {"scene": scene} | {name: copy.deepcopy(part.state_dict()) for name, part in self._parts.items()}
-
-    def _restore(self, state: Mapping[str, Any]) -> None:
-        # new Parameters, as a live autograd graph relies on the shapes of the old ones
-        surfels = self.scene.surfels
-        rows = {name: state["scene"][f"surfels.{name}"] for name in surfels.keys()}
-        none = surfels["means"].new_zeros(0, dtype=torch.int64)
-        replace_rows(surfels, self.strategy.optimizers, none, rows, self.strategy.on_resize)
-        self.scene.resize_for_state(state["scene"])
-        self.scene.load_state_dict(state["scene"])
-        self.scene.zero_grad(set_to_none=True)
-        for name, part in self._parts.items():
-            part.load_state_dict(copy.deepcopy(state[name]))

@@ -8,29 +8,26 @@ from bitymi_ns.ranges import check_ranges
 from .config import REFERENCE_STEPS, TrainConfig
 
 ERROR_VIEWS, FEWEST_ERROR_VIEWS = 0.1, 64
-"""Number of views on which the error prune measures removals, as a fraction of the run's steps, and its minimum."""
+"""Views of the error prune, as a fraction of the run's steps, and their minimum."""
 FINAL_VIEWS, FEWEST_FINAL_VIEWS = 0.025, 16  # likewise, for each of the four final prunes
-FEWEST_SURVEYED = 32  # minimum number of views to measure tiles on, in runs of any length
-PATIENT_STEPS = 3000  # runs of at least this many steps reach full size as early as the options say
+FEWEST_SURVEYED = 32  # minimum number of views to measure tiles on
+PATIENT_STEPS = 3000  # runs as long reach full size as early as the options say
 
 
 class Schedule:
-    """Events and learning rates of a run of `max_steps` steps.
+    """Events and learning rates of a run. Step counts of the options are scaled to its length; densifications and
+    opacity resets keep a minimum interval and so are fewer in short runs.
 
-    The options state step counts for a run of 30,000 steps; runs of other lengths scale them in proportion.
-    Densifications and opacity resets keep a minimum interval (`min_interval`, `min_reset_interval`) and so are fewer in
-    short runs.
-
-    `step` is the index of a training step, 0 to max_steps - 1. Events take place after that step's optimiser update.
+    `step` is the index of a training step, 0 to max_steps - 1. Events take place after its optimiser update.
 
     Attributes:
-        in_pixels: the rate of the means is in pixels, see `step_sizes`; in world units otherwise.
+        in_pixels: the rate of the means is in pixels (`step_sizes`), else in world units.
         short_run_gain: factor of the surfels' learning rates, above 1 in runs of fewer than 30,000 steps: Adam moves a
-            parameter by about its rate per step, so that shorter runs would end long before the surfels have converged.
+            parameter by about its rate per step.
         freeze_every: interval of the steps that train the field after `freeze_after`.
-        error_views, final_views, survey_views: numbers of views on which the error prune and each final prune measure
-            removals, and on which tiles of texels are measured, or all if there are fewer.
-        texels_start, texel_steps: first step of the texel stage, and its number of steps.
+        error_views, final_views, survey_views: maximum numbers of views on which the error prune and each final prune
+            measure removals, and on which tiles are measured.
+        texels_start, texel_steps: first step of the texel stage, and number of its steps.
     """
 
     def __init__(
@@ -38,8 +35,7 @@ class Schedule:
     ) -> None:
         """
         Args:
-            max_steps: length of the run in steps.
-            extent: scene extent in world units.
+            extent: scene extent, world units.
             texels: the run ends with a texel stage.
             pixels: mean number of opaque, unmasked pixels per photograph.
 
@@ -63,8 +59,8 @@ class Schedule:
         self.plan()
 
     def plan(self, begun: int | None = None) -> None:
-        """Plan the events of the run. `begun`: step at which the texels of a resumed run began, whatever its length
-        was: since then pictures have full size and no surfel may be added; None: it has none."""
+        """Plan the events of the run. `begun`: step at which the texels of a resumed run began: pictures then have full
+        size and no surfel may be added; None: it has none."""
         config, densify = self.config, self.config.densify
         # short runs skip events to keep the minimum interval
         reset = densify.reset_interval * self._stride(densify.reset_interval, densify.min_reset_interval)
@@ -90,7 +86,7 @@ class Schedule:
             self._last_part = Schedule(replace(config, lr=slower), self.texel_steps, self.extent)
 
     def scaled(self, step_at_30k: float) -> int:
-        """Scale a step count stated for 30,000 steps to this run: 0 stays 0, others become at least 1."""
+        """Scale a step count for 30,000 steps to this run; at least 1 unless it is 0."""
         if step_at_30k <= 0:
             return 0
         return max(1, math.floor(step_at_30k * self.max_steps / REFERENCE_STEPS + 0.5))
@@ -104,61 +100,55 @@ class Schedule:
         return frozenset(step for step in steps if step <= last)
 
     def reset_opacity(self) -> float:
-        """Compute the opacity after a reset: `reset_opacity`, or more in short runs.
+        """Compute the opacity after a reset: `reset_opacity`, or more with resets less than about 370 steps apart.
 
-        Adam moves a logit by at most its learning rate per step, so a reset lowers opacities only as far as they can
-        recover in half the time to the next reset. Otherwise a short run would have no opaque surfels, and its final
-        prunes would remove nearly all. This matters if resets are less than about 370 steps apart (fewer with the
-        higher rates of a short run).
+        Adam moves a logit by at most its learning rate per step: a reset lowers opacities only as far as they can
+        recover in half the time to the next one. Otherwise final prunes of a short run would remove nearly all.
         """
         densify = self.config.densify
         deepest = max(-500.0, -0.5 * self.reset_every * self.lr("opacity_logits", 0))  # exp() overflows beyond
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
 
     def recovering(self, step: int) -> bool:
-        """Return True in the first half of the interval after an opacity reset, when opacities may still be low."""
+        """Return True in the first half of the interval after an opacity reset."""
         return any(reset < step <= reset + max(1, self.reset_every // 2) for reset in self.reset_steps)
 
     def overdraw_counts(self, step: int) -> bool:
-        """Return True if the overdraw loss is part of this step's objective."""
+        """Return True if the step has the overdraw loss."""
         loss = self.config.loss
         first, last = self.scaled(loss.overdraw_start), self.scaled(loss.overdraw_stop)
         return loss.overdraw_weight > 0.0 and first <= step < last
 
     def geometry_counts(self, step: int) -> bool:
-        """Return True if the depth and normal losses are part of this step's objective, for views with such maps."""
+        """Return True if the step has depth and normal losses."""
         loss = self.config.loss
         return max(loss.depth_weight, loss.normal_weight) > 0.0 and step % loss.geometry_interval == 0
 
     def densification_over(self, step: int) -> bool:
-        """Return True if no densification follows this step, so that its statistics are not needed."""
+        """Return True if no densification follows."""
         return not self.densify_steps or step > max(self.densify_steps)
 
     def field_trains(self, step: int) -> bool:
-        """Return True if the texture is trained in this step; in other steps it is evaluated without gradient. From
-        `freeze_after` on a field is trained in one step of `freeze_every` (section Training Time of the paper); short
-        runs freeze less, since a tenth of their steps is too few."""
+        """Return True if the texture is trained in this step; else it is evaluated without gradient. From
+        `freeze_after` on a field is trained in one step of `freeze_every` (section Training Time of the paper)."""
         return self.texels_learn(step) or step < self.scaled(self.config.freeze_after) or step % self.freeze_every == 0
 
     def texels_learn(self, step: int) -> bool:
-        """Return True in the texel stage."""
         return step >= self.texels_start
 
     def texel_rate(self, step: int, views: int = 1) -> float:
-        """Compute the rate of the texels in a step of the texel stage, per pass over `views` views. The cosine decay to
-        0 halves the distance that they can move; if the passes are too few to move by `travel` at `rate`, that is
-        raised."""
+        """Compute the rate of the texels in a step, per pass over `views` views: `rate`, or more if the passes are too
+        few to move by `travel`. The cosine decay halves the distance."""
         texels = self.config.texels
         needed = 2.0 * texels.travel * views / self.texel_steps
         return max(texels.rate, min(needed, texels.travel)) * self._falling(step)
 
     def dropout(self, passes: float) -> float:
-        """Compute the probability with which a view leaves a surfel out, in a run that renders each photograph `passes`
-        times."""
+        """Compute the probability with which a view leaves a surfel out. `passes`: over the photographs."""
         return self.config.dropout * min(1.0, max(0.0, passes / self.config.dropout_passes - 1.0))
 
     def pose_pixels(self, step: int) -> float:
-        """Compute the length of a pose step, pixels; 0 if poses are fixed in this step."""
+        """Compute the length of a pose step, pixels; 0: poses are fixed."""
         poses = self.config.poses
         first, last = self.scaled(poses.start), self.scaled(poses.stop)
         if self.config.refine_poses == "off" or not first <= step < last:
@@ -169,17 +159,16 @@ class Schedule:
         return falling(1.0, step - self.texels_start, self.texel_steps)
 
     def resolution_factor(self, step: int) -> float:
-        """Compute the factor of the image size, 2^-k; 1 from the last doubling on."""
+        """Compute the factor of the image size, 2^-k."""
         return 2.0 ** -sum(step < doubling for doubling in self._doublings)
 
     def _image_doublings(self, pixels: float) -> list[int]:
         """List the steps from which the image size is doubled, `resolution_schedule` apart.
 
-        Short runs with a texel stage stretch that interval by `short_run_gain`, but reach full size before the texel
-        stage: until then smaller images teach the surfels as much at a lower cost. Three limits on the stretch:
-        images with few opaque, unmasked pixels would show too little (square root of these over `small_photograph`);
-        long runs learn more than small images show (less stretch from about 1,850 steps on, none from `PATIENT_STEPS`
-        on); and the texel stage needs full size.
+        Short runs with a texel stage stretch that interval by `short_run_gain`: smaller images teach the surfels as
+        much at a lower cost. Three limits: images of few `pixels` would show too little (square root of these over
+        `small_photograph`); longer runs learn more than small images show (less stretch from about 1,850 steps on, none
+        from `PATIENT_STEPS` on); the texel stage needs full size.
         """
         apart, count = self.config.resolution_schedule, self.config.num_downscales
         if apart <= 0 or count <= 0:
@@ -191,8 +180,7 @@ class Schedule:
         return [self.scaled(apart * (i + 1)) for i in range(count)]
 
     def lr(self, name: str, step: int) -> float:
-        """Compute the learning rate of a parameter in this step; that of the means in pixels if `in_pixels`. `name`: a
-        surfel parameter, field_table, field_mlp or exposure."""
+        """Compute the learning rate of a surfel parameter, field_table, field_mlp or exposure."""
         rates, gain = self.config.lr, self.short_run_gain
         if self._last_part is not None and self.texels_learn(step) and not name.startswith(("field", "exposure")):
             return self._last_part.lr(name, 0) * self._falling(step)
@@ -210,7 +198,7 @@ class Schedule:
 
 
 def falling(rate: float, step: int, steps: int) -> float:
-    """Compute the cosine decay of a rate from `rate` to 0 over `steps` steps."""
+    """Compute the cosine decay from `rate` to 0 over `steps` steps."""
     return rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
 
 

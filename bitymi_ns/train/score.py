@@ -19,20 +19,20 @@ if TYPE_CHECKING:
 
 
 MOST_ERROR = 1e-3
-"""Upper bound (30 dB) on the mean squared error whose share limits a prune: errors from exposure or moving objects must
-not hide those of a missing surfel."""
+"""Upper bound (30 dB) on the error whose share limits a prune: those of exposure or moving objects must not hide a
+missing surfel."""
 
 
 @dataclass(frozen=True)
 class Scores:
     """One row per surfel."""
 
-    importance: Tensor  # [N] int64, mean number per view of bad pixels that the surfel is blended into, rounded down
+    importance: Tensor  # [N] int64, mean number of bad pixels per view that the surfel is blended into, rounded down
     prune: Tensor  # [N] float32 in [0, 1]; high: covers many bad pixels in views of high loss
 
 
 def normalise(values: Tensor) -> Tensor:
-    """Shift and scale values to [0, 1]; all zeros if they are equal or not finite."""
+    """Shift and scale values to [0, 1]; zeros if they are equal or not finite."""
     spread = values.max() - values.min() if values.numel() else values.new_zeros(())
     if not bool(torch.isfinite(spread) & (spread > 1e-12)):
         return torch.zeros_like(values)
@@ -40,9 +40,8 @@ def normalise(values: Tensor) -> Tensor:
 
 
 def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | None = None) -> Tensor:
-    """Find the pixels, [H, W] bool, whose error, normalised over the image, is above `threshold`. `rgb` and `target`:
-    [H, W, 3]; the error is the mean of |rgb - target| over the channels. `threshold`: in [0, 1]. `mask`: [H, W] or [H,
-    W, 1] bool, True where the pixel counts; other pixels are never bad."""
+    """Find the pixels, [H, W] bool, whose L1 error, normalised over the image, is above `threshold`. `rgb`, `target`:
+    [H, W, 3]. `mask`: [H, W] or [H, W, 1] bool; pixels where it is False are never bad."""
     error = (rgb - target).abs().mean(-1)
     if mask is None:
         return normalise(error) > threshold
@@ -53,10 +52,8 @@ def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | Non
 
 
 def _random_signs(like: Tensor, seed: int) -> Tensor:
-    """Draw +1 or -1 for every element of a tensor, the same on every device.
-
-    Each random byte gives eight signs: the CPU generates 200 M numbers a second, so that one number per sign would take
-    longer than a GPU takes to render the view."""
+    """Draw +1 or -1 for every element of a tensor, the same on every device. A random byte gives eight signs: one
+    number per sign would take longer than a GPU takes to render the view."""
     count = like.numel()
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(0, 256, (-(-count // 8),), dtype=torch.int32, generator=generator).to(like.device)
@@ -66,10 +63,10 @@ def _random_signs(like: Tensor, seed: int) -> Tensor:
 
 @torch.no_grad()
 def multi_view_scores(scene: Scene, views: Sequence[View], config: TrainConfig, processes: Processes = ALONE) -> Scores:
-    """Render the views and score every surfel (the score s_d of the paper and FastGS's prune score).
+    """Score every surfel: s_d of the paper and FastGS's prune score; 0 without views.
 
     Every fragment that is blended at a bad pixel counts one for its surfel, whatever its weight. `views`: at the
-    resolution to compare at, dealt out to the processes; without views all scores are 0."""
+    resolution to compare at, dealt out to the processes."""
     n = len(scene)
     device = scene.surfels["means"].device
     total = torch.zeros(n, dtype=torch.int64, device=device)
@@ -94,16 +91,12 @@ def removal_errors(
 ) -> tuple[Tensor, Tensor]:
     """Estimate the squared change of the views when each surfel is removed, and measure their squared error.
 
-    An image C is linear in the opacity o of each surfel, so removing it changes the image by v = -o dC/do. Over
-    independent signs r, E[(r . v)^2] = |v|^2 (Hutchinson 1989), and one backward pass gives r . v for all surfels.
-
-    Args:
-        views: at the resolution to compare at.
-        seed: seed of the signs and of random backgrounds.
+    An image C is linear in the opacity o of a surfel: removing it changes the image by v = -o dC/do. Over independent
+    signs r, E[(r . v)^2] = |v|^2 (Hutchinson 1989), and one backward pass gives r . v for all surfels.
 
     Returns:
-        Squared change [N] float64, summed over unmasked pixels, channels and views, 0 if no view shows the surfel; and
-        the squared error of the views, summed likewise, a float64 scalar, its mean clamped to `MOST_ERROR`.
+        Squared change [N] float64, summed over unmasked pixels, channels and views; and the squared error of the views,
+        likewise, a float64 scalar, its mean clamped to `MOST_ERROR`.
     """
     logits = scene.surfels["opacity_logits"]
     device = logits.device

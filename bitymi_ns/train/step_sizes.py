@@ -1,4 +1,4 @@
-"""Step sizes of surfel positions in pixels of the photographs, independent of the scale of the capture."""
+"""Step sizes of surfel positions in pixels of the photographs."""
 
 from __future__ import annotations
 
@@ -15,21 +15,18 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
     from .schedules import Schedule
 
-MEASURED = 64  # maximum number of training views to measure footprints in, evenly spaced
+MEASURED = 64  # maximum number of training views to measure footprints in
 
 
 @torch.no_grad()
 def pixel_footprints(means: Tensor, cameras: Sequence[Camera], near: float, extent: float) -> Tensor:
-    """Measure the side of a pixel at each surfel: depth over focal length in the nearest view that contains its centre.
+    """Measure the side of a pixel at each surfel, [N] world units: depth over focal length in the nearest view that
+    contains its centre; a surfel outside all views gets the median of the others.
 
     Args:
         means: [N, 3] world positions.
-        cameras: the training cameras at full size.
         near: near plane, camera z.
-        extent: scene extent in world units, used as depth if no view contains any surfel.
-
-    Returns:
-        [N] in the dtype of `means`, world units; a surfel outside all views gets the median of the others.
+        extent: scene extent, world units; the depth if no view contains any surfel.
     """
     nearest = torch.full_like(means[:, 0], torch.inf)
     for camera in cameras:
@@ -42,7 +39,7 @@ def pixel_footprints(means: Tensor, cameras: Sequence[Camera], near: float, exte
 
 
 def _focal(camera: Camera) -> Tensor:
-    """Average the focal lengths along both axes, pixels: a scalar on the camera's device."""
+    """Average the focal lengths along both axes, pixels."""
     return 0.5 * (camera.K[0, 0] + camera.K[1, 1])
 
 
@@ -60,7 +57,7 @@ class StepSizes:
         self._set(torch.zeros(0))
 
     def measure(self, scene: Scene, always: bool = True) -> None:
-        """Measure the footprints of the current surfels. `always`: also if the number of surfels has not changed."""
+        """Measure the footprints; unless `always`, only if the number of surfels has changed."""
         if self.schedule.in_pixels and (always or len(self.footprints) != len(scene)):
             means = scene.surfels["means"].detach()
             self._set(pixel_footprints(means, self.cameras, scene.near, self.schedule.extent))
@@ -71,19 +68,17 @@ class StepSizes:
         self._relative = footprints / self._typical
 
     def rate(self, name: str, step: int) -> float:
-        """Return the learning rate of a parameter's optimiser; if surfels differ, that of the median surfel."""
+        """Return the learning rate of a parameter, of the median surfel if they differ."""
         rate = self.schedule.lr(name, step)
         return rate * self._typical if name == "means" and self.schedule.in_pixels else rate
 
     def factors(self) -> dict[str, Tensor]:
-        """Return rate factors [N] relative to `rate`, by name, for the parameters with rates per surfel."""
+        """Return rate factors [N] relative to `rate`, by name, of parameters with rates per surfel."""
         return {"means": self._relative} if self.schedule.in_pixels else {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state for a resumed run."""
         return {"footprints": self.footprints}
 
     def load_state_dict(self, state: Mapping[str, Any], device: torch.device) -> None:
-        """Restore what `state_dict` returned."""
         if self.schedule.in_pixels:
             self._set(state["footprints"].to(device))

@@ -1,14 +1,15 @@
 """FastGS densification and pruning by multi-view scores, with the thresholds of `config.DensifyConfig`.
 
 At each densification, in this order:
-- surfels that can never be visible again are removed (a non-finite parameter, or an opacity of 1/255 or less);
-- surfels with many bad pixels and a large gradient are cloned or split, the most important first if the limit does not
-  allow all. With `max_surfels` the number instead grows to that value in equal increments: parents are sampled in
-  proportion to gradient times bad pixels, and faint surfels are replaced if there are more parents than the increment;
+- surfels that can never be visible again are removed (a parameter that is not finite, an opacity of 1/255 or less);
+- surfels with many bad pixels and a large gradient are cloned or split, the most important first if there is a limit.
+  With `max_surfels` the number instead grows to that value in equal increments: parents are sampled in proportion to
+  gradient times bad pixels, and faint surfels are replaced if there are more parents than the increment;
 - up to half of the candidates for pruning, sampled at random, are removed;
 - opacities are clamped.
-After the last densification, surfels whose removal hardly changes the images are pruned; between 60 and 90 % of the run
-four final prunes do the same among faint surfels. docs/training.md states the published rules.
+
+After the last densification, surfels whose removal hardly changes the images are pruned; four final prunes do the same
+among faint surfels. docs/training.md states the published rules.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
 DrawViews = Callable[[int, torch.Generator], Sequence[View]]
-"""(k, CPU generator) -> k different training views, or all if there are fewer."""
+"""(k, CPU generator) -> at most k different training views."""
 
 SPLIT_LONG, SPLIT_WIDE = 0.6, 0.7
-"""Scales of the halves of a split surfel, along its long axis and across it, relative to the surfel's."""
+"""Scales of the halves of a split surfel, along its long axis and across it, relative to its own."""
 SPLIT_APART = 0.7  # distance of the halves' centres from the surfel's, in scales of its long axis
-SPLIT_OPACITY = 0.9  # opacity of the halves relative to the surfel's: they overlap where it is most opaque
-NO_BAD_PIXEL = 0.1  # added to counts of bad pixels when parents are sampled, so that surfels without any have a chance
+SPLIT_OPACITY = 0.9  # opacity of the halves, likewise: they overlap where it is most opaque
+NO_BAD_PIXEL = 0.1  # added to counts of bad pixels when parents are sampled: surfels without any have a chance
 STATISTICS = ("grad_sum", "abs_grad_sum", "visible_count", "max_radius")
 
 
@@ -57,11 +58,11 @@ class Strategy:
 
     Attributes:
         statistics: [4, N] since the last densification, named by `STATISTICS`: sum over views of the gradient norm of
-            the projected centre, NDC; the same for the absolute gradient (AbsGS); number of views in which the surfel
-            was visible; largest half extent on screen, pixels.
-        generator: CPU generator of all random choices.
+            the projected centre, NDC, and of the absolute gradient (AbsGS); number of views in which the surfel was
+            visible; largest half extent on screen, pixels.
+        generator: of all random choices, on the CPU.
         most: number of surfels at which densification stops; 0: no limit.
-        most_by_memory: the same number, if memory has set it; else 0.
+        most_by_memory: the same, if memory has set it; else 0.
     """
 
     def __init__(
@@ -78,10 +79,8 @@ class Strategy:
         Args:
             scene: its surfel parameters are replaced when their number changes.
             optimizers: by surfel parameter name.
-            schedule: events and options of the run.
-            on_resize: called with the name and the new Parameter when a surfel parameter is replaced.
-            image_pixels: total over all training images at full size, for `densify.pixels_per_surfel`; 0: no limit.
-            first_surfels: initial number of surfels, for `densify.growth`.
+            image_pixels: total over all training images at full size; 0: no limit on surfels.
+            first_surfels: initial number of surfels.
         """
         self.scene, self.optimizers, self.processes, self.on_resize = scene, optimizers, processes, on_resize
         self.schedule, self.config = schedule, schedule.config
@@ -93,7 +92,7 @@ class Strategy:
         self.statistics = torch.zeros(len(STATISTICS), 0)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the statistics, the state of the generator, and the number at which memory stops densification."""
+        """Return the state for a resumed run."""
         rows = zip(STATISTICS, self.statistics.clone(), strict=True)
         return {**dict(rows), "generator": self.generator.get_state(), "most_by_memory": self.most_by_memory}
 
@@ -105,7 +104,7 @@ class Strategy:
         self.most = self.most_by_memory or self._most
 
     def accumulate(self, *projections: Projection) -> None:
-        """Add the statistics of a step's training views, over all processes; call it after the backward passes."""
+        """Add the statistics of a step's views, over all processes, after the backward passes."""
         if self.processes.views == 1:
             self._accumulate_view(*projections)
             return
@@ -121,7 +120,6 @@ class Strategy:
 
     @torch.no_grad()
     def _accumulate_view(self, projection: Projection) -> None:
-        """Add the statistics of one training view."""
         n, device = len(projection.radii), projection.radii.device
         if self.statistics.shape[1] == 0:
             self.statistics = torch.zeros(len(STATISTICS), n, device=device)
@@ -150,9 +148,8 @@ class Strategy:
         torch.where(visible, torch.maximum(max_radius, radius), max_radius, out=max_radius)
 
     def step(self, step: int, views: DrawViews) -> dict[str, float]:
-        """Densify, reset opacities and prune as scheduled after the optimiser update of `step`, the step that just
-        ended. `views`: samples the views for the scores. Returns counts of what was done, by name; empty if nothing was
-        due."""
+        """Densify, reset opacities and prune as scheduled after the optimiser update of `step`. `views`: samples the
+        views for the scores. Returns counts by action; empty if nothing was due."""
         report: dict[str, float] = {}
         if 0 < self.config.densify.max_surfels < len(self.scene):  # a loaded scene may exceed the limit
             report |= self._drop_dead()
@@ -213,7 +210,7 @@ class Strategy:
         children = self._halves(surfels, splits)
         new = {name: torch.cat([p.detach()[clones], children[name]]) for name, p in surfels.items()}
 
-        # the budget counts candidates among old and new surfels; only old ones are sampled
+        # the budget counts old and new candidates; only old ones are sampled
         old_candidate, new_candidate = self._prunable(surfels), self._prunable(new)
         if step > self.schedule.reset_every:  # the first opacity reset is over
             old_candidate |= max_radius > config.prune_screen
@@ -232,8 +229,8 @@ class Strategy:
         return report | {"cloned": len(clones), "split": len(splits), "pruned": int(pruned.sum())}
 
     def _heed_memory(self, step: int, n: int, wanted: int, device: torch.device) -> dict[str, float]:
-        """End growth for the rest of the run if `wanted` more surfels than n, with their smallest tiles, might not fit
-        beside a view at full size."""
+        """End growth for good if `wanted` more surfels than n, with their smallest tiles, might not fit beside a view
+        at full size."""
         to_come = (1.0 - self.schedule.resolution_factor(step) ** 2) * view_bytes(self.schedule.pixels)
         surfel_bytes = PER_SURFEL + PER_TEXEL * SMALLEST**2
         fitting = n + max(0, int((room_to_grow(device, self.processes) - to_come) / surfel_bytes))
@@ -243,7 +240,7 @@ class Strategy:
         return {"most_by_memory": fitting}
 
     def _halves(self, surfels: Tensors, rows: Tensor) -> dict[str, Tensor]:
-        """Split surfels into two halves along their long axes, which together look about like the surfel."""
+        """Split surfels into halves along their long axes, which together look about the same."""
         halves = {name: p.detach()[rows].repeat_interleave(2, dim=0) for name, p in surfels.items()}
         long = one_hot(halves["log_scales"].argmax(-1), 2).to(halves["log_scales"])  # [2S, 2]
         side = long.new_tensor([1.0, -1.0]).repeat(len(rows))[:, None]
@@ -270,15 +267,15 @@ class Strategy:
 
     @torch.no_grad()
     def _final_prune(self, views: DrawViews) -> dict[str, float]:
-        """Remove the faint surfels that matter little; after an opacity reset many faint ones do matter."""
+        """Remove faint surfels, except those that matter, as many do after an opacity reset."""
         report, config = self._drop_dead(), self.config.densify
         faint = self.scene.surfels["opacity_logits"].sigmoid() < config.final_prune_opacity
         drawn = views(self.schedule.final_views, self.generator)
         return report | self._prune_least(faint, config.final_prune_error, drawn)
 
     def _prune_least(self, among: Tensor, relative_error: float, views: Sequence[View]) -> dict[str, float]:
-        """Remove the surfels `among` [N] bool that change the views least, together by at most a part of the views'
-        squared error (`removal_errors`), as far as `min_surfels` allows."""
+        """Remove the surfels `among` [N] bool that change the views least, together by at most `relative_error` of
+        their squared error (`removal_errors`), as far as `min_surfels` allows."""
         seed = int(torch.randint(1 << 31, (), generator=self.generator))
         added, error = removal_errors(self.scene, views, self.config, seed, self.processes)
         rows = among.nonzero().flatten()
@@ -291,7 +288,7 @@ class Strategy:
         return {"pruned": int(pruned.sum())}
 
     def _drop_dead(self) -> dict[str, float]:
-        """Remove surfels that are not finite or can never be visible again, and the faintest beyond `max_surfels`."""
+        """Remove surfels that can never be visible again, and the faintest beyond `max_surfels`."""
         scene, surfels = self.scene, self.scene.surfels
         if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
             raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")
@@ -309,8 +306,8 @@ class Strategy:
         return {"not_finite": int((~finite).sum()), "invisible": int((pruned & finite).sum())}
 
     def _keep_minimum(self, pruned: Tensor, opacity_logits: Tensor, count: int, among: Tensor | None = None) -> Tensor:
-        """Clear the most opaque entries of `pruned` [N] bool, within `among` [N] bool, as far as needed to leave
-        `min_surfels`; `count` is the number of surfels without this prune."""
+        """Restrict `pruned` [N] bool to `among` [N] bool, and clear its most opaque rows as far as needed to leave
+        `min_surfels` of `count`."""
         if among is not None:
             pruned = pruned & among
         lowest = max(1, self.config.densify.min_surfels)
@@ -320,9 +317,8 @@ class Strategy:
         return pruned & ~_lowest(pruned, missing, -opacity_logits)
 
     def _draw(self, weights: Tensor, k: int) -> Tensor:
-        """Sample k rows (at most the number of positive weights) without replacement, in proportion to `weights`.
-
-        The k rows with the smallest Exp(1) / weight are such a sample; torch.multinomial is limited to 2^24 rows."""
+        """Sample at most k rows of positive weight without replacement, in proportion to it: those with the smallest
+        Exp(1) / weight; torch.multinomial is limited to 2^24 rows."""
         k = min(k, int((weights > 0).sum()))
         race = torch.empty(len(weights), dtype=torch.float64).exponential_(generator=self.generator).to(weights.device)
         return (race / weights).topk(k, largest=False).indices
@@ -341,8 +337,8 @@ class Strategy:
 
 
 def most_surfels(config: TrainConfig, image_pixels: int, first_surfels: int = 0) -> int:
-    """Compute the number of surfels at which densification stops; 0: no limit. `image_pixels`: total over all training
-    images at full size. `first_surfels`: initial number of surfels."""
+    """Compute the number of surfels at which densification stops; 0: no limit. `image_pixels`, `first_surfels`: as in
+    `Strategy`."""
     densify = config.densify
     if densify.max_surfels > 0 or densify.pixels_per_surfel == 0 or image_pixels == 0:
         return densify.max_surfels
@@ -358,8 +354,7 @@ def finite_rows(scene: Scene) -> Tensor:
 
 
 def _lowest(among: Tensor, k: int, *values: Tensor) -> Tensor:
-    """Select, [N] bool, the `k` rows within `among` [N] bool with the lowest first `values` [N], equal ones by the next
-    ones."""
+    """Select the `k` rows among [N] bool with the lowest first `values` [N], equal ones by the next ones: [N] bool."""
     rows = among.nonzero().flatten()
     for keys in reversed(values):
         rows = rows[keys.detach()[rows].argsort(stable=True)]

@@ -1,4 +1,4 @@
-"""The texel stage, the last part of a run: every surfel gets a tile at the resolution of the training views."""
+"""The texel stage of a run: every surfel gets a tile at the resolution of the training views."""
 
 from __future__ import annotations
 
@@ -33,14 +33,13 @@ if TYPE_CHECKING:
     from .schedules import Schedule
     from .views import DownscaledViews, View
 
-SMALLEST = 4  # side of the smallest tile, texels: a block of BC7
-FEW = 1 << 23  # total number of texels that runs of any length may have: 370 MB
-FEWER = 0.8  # factor on the texels per tile, repeated until the total is below the limit
+SMALLEST = 4  # side of the smallest tile: a block of BC7
+FEW = 1 << 23  # texels that runs of any length may have: 370 MB
+FEWER = 0.8  # factor on the texels per tile, until the total is below the limit
 LEAST_COVERAGE = 0.25
-"""Lower bound of a texel's coverage if only a sample of the views is measured, relative to the coverage in one view.
-It limits a texel's step to about four times the rate. A full view as bound would slow down occluded texels."""
-SURVEY_PIXELS = 10_000
-"""Coverage is measured at half size if views have at least this many pixels then: as accurate, in half the time."""
+"""Lower bound of a texel's coverage if only some views are measured, relative to that in one view: limits its step to
+about four times the rate, without slowing down occluded texels."""
+SURVEY_PIXELS = 10_000  # coverage is measured at half size if views then have as many: as accurate
 
 
 class LearningTexels:
@@ -50,7 +49,7 @@ class LearningTexels:
         self.scene, self.schedule, self.options, self.processes = scene, schedule, schedule.config.texels, processes
         self._rates: list[RemovableHandle] = []
         self._views = 1
-        self.most_by_memory = 0  # number of texels to which memory has limited the tiles; 0: it has not
+        self.most_by_memory = 0  # texels to which memory has limited the tiles; 0: it has not
 
     @property
     def views_to_come(self) -> int:
@@ -58,7 +57,7 @@ class LearningTexels:
         return self.processes.views * self.schedule.texel_steps
 
     def begin(self, step: int, views: DownscaledViews) -> bool:
-        """Create the tiles on the first step of the texel stage; True on that step."""
+        """Create the tiles and return True in the first step of the texel stage."""
         self._views = len(views)
         if not self.schedule.texels_learn(step) or isinstance(self.scene.field, TexelField):
             return False
@@ -77,8 +76,8 @@ class LearningTexels:
         return True
 
     def prepare(self, step: int, view: View, factor: float) -> TexelDescent | None:
-        """Return the update of the texels by the backward pass of this view; with several views per step None, and
-        their gradients are scaled by the step size."""
+        """Return the update of the texels by the backward pass of this view; None with several views per step, whose
+        gradients are scaled by the step size."""
         field = self.scene.field
         if not isinstance(field, TexelField):
             return None
@@ -88,7 +87,6 @@ class LearningTexels:
         for handle in self._rates:
             handle.remove()
         self._rates = []
-        # with one view per step, its backward pass updates the colours; with several, `step` does
         descent = TexelDescent(field.share, rate) if self.processes.views == 1 else None
         if descent is None:
             self._rates.append(field.texels.register_hook(lambda gradient: gradient * rate))
@@ -99,7 +97,7 @@ class LearningTexels:
 
     @property
     def _parameters(self) -> list[Parameter]:
-        """Texel colours and alphas that `step` updates."""
+        """Colours, unless a backward pass updates them, and alphas."""
         field = self.scene.field
         if not isinstance(field, TexelField):
             return []
@@ -108,7 +106,7 @@ class LearningTexels:
 
     @torch.no_grad()
     def average(self) -> None:
-        """Average the gradients over all views of the step; processes exchange only rows with a nonzero gradient."""
+        """Average the gradients over all views of the step; processes exchange rows with a nonzero one."""
         parameters = self._parameters
         gradients = []
         for values in parameters:
@@ -145,9 +143,8 @@ def blank_texels(
 ) -> TexelField:
     """Create a tile for every surfel, with residuals of 0, and alphas of 1 if alphas are trained.
 
-    A surfel without fragments that may have a residual gets one texel. `views`: sample of the training views at full
-    size; only cameras and masks are used. `count`: number of all training views. `to_come`: number of renders in the
-    texel stage."""
+    A surfel without fragments that may have a residual gets one texel. `views`: sample of the `count` training views,
+    at full size; cameras and masks are used. `to_come`: number of renders in the texel stage."""
     return _blank_texels(scene, views, count, options, to_come)[0]
 
 
@@ -160,8 +157,8 @@ def _blank_texels(
     to_come: float,
     fitting: float = math.inf,
 ) -> tuple[TexelField, bool]:
-    """Do the work of `blank_texels`, with at most `fitting` texels as far as the smallest tiles allow; True: that is
-    fewer than there would be."""
+    """As `blank_texels`, with at most `fitting` texels as far as the smallest tiles allow; True: they are fewer than
+    wanted."""
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound
@@ -185,7 +182,7 @@ def _blank_texels(
 
 
 def most_texels(options: TexelConfig, rendered: float) -> float:
-    """Compute the maximum total number of texels for a texel stage that renders `rendered` pixels."""
+    """Compute the maximum number of texels for a texel stage that renders `rendered` pixels."""
     return max(FEW, rendered / options.rendered_pixels_per_texel)
 
 
@@ -197,18 +194,17 @@ def mean_pixels(cameras: Sequence[Camera]) -> float:
 def single_view_coverage(
     surfels: Mapping[str, Tensor], cameras: Sequence[Camera], size: Tensor, extent: Tensor, near: float
 ) -> Tensor:
-    """Estimate the coverage of each texel in one unoccluded view, pixels [T]: its area in the nearest view times the
-    surfel's opacity. `cameras`: of the measured views; the others are assumed to be about as near. `size` and `extent`:
-    [N, 2] and [N] of the tiles.
+    """Estimate the coverage of each texel in one unoccluded view, pixels [T]: its area in the nearest of `cameras`
+    times the opacity. `size`, `extent`: [N, 2] and [N] of the tiles.
 
-    An unmeasured view may show texels that are occluded in all measured ones; by the measured coverage alone, their
-    steps would be a hundred times too long."""
+    Other views may show texels that all measured ones occlude; by the measured coverage alone, their steps would be a
+    hundred times too long."""
     area = tile_pixels(surfels, cameras, extent, near).prod(1) / size.prod(1)
     return (area * surfels["opacity_logits"].sigmoid()).repeat_interleave(size.long().prod(1))
 
 
 def tile_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: Tensor, near: float) -> Tensor:
-    """Compute the sides [N, 2], in pixels, of tiles of half sides `extent`, in the view where they are largest."""
+    """Compute the sides [N, 2], pixels, of tiles of half sides `extent`, in the view where they are largest."""
     scales, axes = surfels["log_scales"].exp(), tangents(surfels["quats"])
     return max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near) * (extent / SUPPORT)[:, None]
 
@@ -222,9 +218,9 @@ def tiles_as_seen(
     options: TexelConfig,
     to_come: float = math.inf,
 ) -> tuple[Tensor, Tensor]:
-    """Choose tile sizes. A tile covers the part of its surfel where fragments reach the weight bound, at the resolution
-    of the views and with at most one texel per `options.pixels_per_texel`. `to_come`: number of renders in the texel
-    stage. Returns sizes [N, 2] int32 and half sides [N] in scale units; 1 x 1 if no fragment reaches the bound."""
+    """Choose sizes [N, 2] int32 and half sides [N], scale units, of tiles. They cover the part of a surfel where
+    fragments reach the weight bound, at the resolution of the views; 1 x 1 if none does. `to_come`: as of
+    `blank_texels`."""
     extent = visible_extent(*kernel_parameters(surfels, seen.in_front), weight_bound)
     size = seen_sides(tile_pixels(surfels, cameras, extent, near), SMALLEST, options.largest)
     texels = seen.pixels / options.pixels_per_texel
@@ -235,8 +231,8 @@ def tiles_as_seen(
 
 
 def bounded(size: Tensor, texels: Tensor, most: float) -> Tensor:
-    """Coarsen tiles of `size` [N, 2] and at most `texels` [N] texels each until there are at most `most` in all, or all
-    are of the smallest size."""
+    """Coarsen tiles of `size` [N, 2] and at most `texels` [N] texels each to at most `most` in all, or the smallest
+    size."""
     while int(size.long().prod(1).sum()) > most and int(size.max()) > SMALLEST:
         texels = FEWER * texels
         size = coarsened(size, texels, SMALLEST)
@@ -245,7 +241,7 @@ def bounded(size: Tensor, texels: Tensor, most: float) -> Tensor:
 
 @torch.no_grad()
 def coverage(scene: Scene, field: TexelField, views: Sequence[View]) -> Tensor:
-    """Sum blending weight times bilinear weight of each texel, [T] pixels, over unmasked fragments and views."""
+    """Sum blending weight times bilinear weight of each texel over unmasked fragments and views: [T] pixels."""
     covered = field.texels.new_zeros(len(field.texels), 2)
     for view in views:
         geometry = (value.detach() for value in geometry_of(scene.surfels))

@@ -1,4 +1,4 @@
-"""Checks of the views, points and modes of torch that a caller's own program gives."""
+"""Checks of a caller's views and points, and of torch's modes."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -8,13 +8,12 @@ from torch import Tensor
 
 from .views import View
 
-_ROUNDING = 1e-3  # by which resampled images may lie outside of 0 to 1
+_ROUNDING = 1e-3  # by which resampled images may exceed 0 to 1
 
 
 @contextmanager
 def learning_modes() -> Iterator[None]:
-    """Enable gradients, and make new tensors float32, in the block; also a decorator. Raises ValueError: torch is in
-    inference mode, whose tensors cannot learn."""
+    """Enable gradients, and make new tensors float32. Raises ValueError: torch is in inference mode."""
     if torch.is_inference_mode_enabled():
         raise ValueError("nothing can learn in torch.inference_mode(): call this outside of it")
     before = torch.get_default_dtype()
@@ -27,8 +26,8 @@ def learning_modes() -> Iterator[None]:
 
 
 def checked_views(views: Sequence[View], name: str = "views") -> list[View]:
-    """Check views, and convert their masks to bool. Raises ValueError: a camera, image, mask, correction or map has
-    another shape, type or range than `View` states; the message has its name and index."""
+    """Check views, and convert masks to bool. Raises ValueError: something has another shape, type or range than `View`
+    states; names it with its index."""
     return [_checked(view, f"{name}[{i}]") for i, view in enumerate(views)]
 
 
@@ -82,7 +81,6 @@ def _check_finite(values: Tensor, name: str) -> None:
 
 
 def _check_image(values: Tensor, name: str) -> None:
-    """Check colours: floats from 0 to 1."""
     if not values.is_floating_point():
         raise ValueError(f"{name} has to be float, from 0 to 1, not {values.dtype}")
     _check_finite(values, name)

@@ -1,4 +1,4 @@
-"""Training views: camera and photograph, with optional mask, depth and normals."""
+"""Training views."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .config import TrainConfig
 if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput, Scene
 
-DOWNSCALED_BYTES = 1 << 28  # cache of downscaled images on the CPU; others are downscaled at every use
+DOWNSCALED_BYTES = 1 << 28  # cache of downscaled images on the CPU
 COVERED_VIEWS = 8  # views sampled by `covered_fraction`
 
 
@@ -30,13 +30,13 @@ class View(NamedTuple):
         camera: camera of the full-size image.
         image: [H, W, 3] or, with straight (not premultiplied) alpha, [H, W, 4]; float in [0, 1] or uint8.
         mask: [H, W] or [H, W, 1] bool, True where the pixel counts; None: everywhere.
-        correction: maps the scene's colour c to the photograph's: [3] gain, gain * c; or [3, 4] matrix and offset,
+        correction: from the scene's colour c to the photograph's: [3] gain, gain * c; or [3, 4] matrix and offset,
             matrix @ c + offset; None: no correction.
-        depth: [H, W] or [H, W, 1] float, camera z in world units, 0 or NaN where unknown; None: unknown everywhere.
+        depth: [H, W] or [H, W, 1] float, camera z in world units, 0 or NaN where unknown; None: everywhere.
         normal: [H, W, 3] float, surface normals in the camera frame (OpenCV axes, facing the camera), 0 or NaN where
-            unknown; None: unknown everywhere.
+            unknown; None: everywhere.
         counted: number of True pixels of `mask`; None: not known.
-        file: file of the photograph; None: not known.
+        file: of the photograph; None: not known.
     """
 
     camera: Camera
@@ -50,25 +50,24 @@ class View(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Memory of image, mask, depth and normals, bytes."""
         return sum(map_.nbytes for map_ in (self.image, self.mask, self.depth, self.normal) if map_ is not None)
 
     def to(self, device: torch.device | str) -> View:
-        """Move the view to a device; copies to a GPU are asynchronous, from pinned memory."""
+        """Move the view to a device, to a GPU asynchronously, from pinned memory."""
         maps = {name: _moved(value, device) for name, value in self._asdict().items() if isinstance(value, Tensor)}
         return self._replace(camera=self.camera.to(device), **maps)
 
     def shown(self, rgb: Tensor, alpha: Tensor, background: Tensor | None) -> Tensor:
-        """Apply this photograph's correction to a render, see `shown`."""
+        """Apply this photograph's correction (`shown`)."""
         return shown(rgb, self.correction, alpha, background)
 
     def target(self, background: Tensor | None, device: torch.device | str) -> Tensor:
-        """Compose the photograph over a colour [3] (None: black) on a device: [H, W, 3]."""
+        """Compose the photograph over a colour [3] (None: black): [H, W, 3]."""
         return over_background(as_float(self.image.to(device)), background)
 
     def drawn(self, scene: Scene, background: Tensor | None) -> tuple[RenderOutput, Tensor, Tensor]:
-        """Render the view without gradients of the texture, for a comparison with its photograph: the output, its rgb
-        [H, W, 3] with the photograph's correction, and the photograph [H, W, 3] over the same background."""
+        """Render the view without gradients of the texture: the output, its rgb [H, W, 3] with the photograph's
+        correction, and the photograph [H, W, 3] over the same background."""
         output = scene.render(self.camera, background, "frozen")
         rgb = self.shown(output.rgb, output.alpha, background)
         return output, rgb, self.target(background, rgb.device)
@@ -80,12 +79,12 @@ class TrainingData:
 
     Attributes:
         views: training views at full size.
-        cameras: of the views, which may read the photographs for it.
-        extent: scene extent in world units (`init.scene_extent`).
-        image_pixels: total over all training views.
+        cameras: of the views, apart from them as these may read photographs.
+        extent: `init.scene_extent`.
+        image_pixels: total over all views.
         first_surfels: initial number of surfels, also in a resumed run.
-        covered: fraction of opaque, unmasked pixels (`covered_fraction`).
-        exif_stops: log2 exposure of each view (`capture.exif.exif_stops`), NaN: unknown; None: unknown for every view.
+        covered: `covered_fraction`.
+        exif_stops: log2 exposure of each view (`capture.exif.exif_stops`), NaN: unknown; None: all unknown.
         files: photograph of each view, which views may share; None: one view per photograph.
     """
 
@@ -106,7 +105,7 @@ def _moved(value: Tensor | None, device: torch.device | str) -> Tensor | None:
 
 
 def covered_fraction(views: Sequence[View]) -> float:
-    """Measure the fraction of pixels that are neither masked nor transparent, on a sample of the views."""
+    """Measure the fraction of opaque, unmasked pixels on a sample of the views."""
     fractions = []
     for view in (views[i] for i in spread(len(views), COVERED_VIEWS)):
         shows = view.image[..., -1:] > 0 if view.image.shape[-1] == 4 else torch.ones((), dtype=torch.bool)
@@ -143,8 +142,8 @@ def as_float(image: Tensor) -> Tensor:
 
 
 def downscale_image(image: Tensor, width: int, height: int) -> Tensor:
-    """Downscale an image by area averaging to [height, width, C]. `image`: [H, W, C]; with C = 4 colours are weighted
-    by alpha, so that hidden colours do not bleed in. `width` and `height`: new size in pixels."""
+    """Downscale an image [H, W, C] by area averaging to [height, width, C]; with C = 4 colours are weighted by alpha,
+    so that hidden colours do not bleed in."""
     if image.shape[:2] == (height, width):
         return image
     alpha = image[..., 3:]
@@ -157,7 +156,7 @@ def downscale_image(image: Tensor, width: int, height: int) -> Tensor:
 
 
 def downscale_mask(mask: Tensor, width: int, height: int) -> Tensor:
-    """Downscale a mask ([H, W] or [H, W, 1] bool) to [height, width, 1]: True where all averaged pixels are True."""
+    """Downscale a mask ([H, W] or [H, W, 1] bool) to [height, width, 1]: True where all pixels are."""
     mask = mask.reshape(*mask.shape[:2], 1)
     if mask.shape[:2] == (height, width):
         return mask
@@ -165,7 +164,7 @@ def downscale_mask(mask: Tensor, width: int, height: int) -> Tensor:
 
 
 def resample_nearest(values: Tensor, width: int, height: int) -> Tensor:
-    """Resample values [H, W, ...] to [height, width, ...] by nearest neighbour: depth must not average across edges."""
+    """Resample values [H, W, ...] to [height, width, ...] by nearest neighbour: edges must not be averaged."""
     rows, columns = (
         ((torch.arange(new, device=values.device) + 0.5) * (old / new)).long()
         for new, old in zip((height, width), values.shape[:2], strict=True)
@@ -179,28 +178,26 @@ def background_changes(config: TrainConfig, view: View) -> bool:
 
 
 def step_background(config: TrainConfig, view: View, step: int, device: torch.device | str) -> Tensor | None:
-    """Choose the background colour [3] of a training step, `config.background`; None: black. A random colour depends
-    only on seed and step."""
+    """Choose the background colour [3] of a training step; None: black. A random one depends on seed and step."""
     if not background_changes(config, view):
         return eval_background(config, device)
     return torch.rand(3, generator=random_numbers(config.seed, step)).to(device, non_blocking=True)
 
 
 def random_numbers(seed: int, number: int, device: torch.device | str = "cpu") -> torch.Generator:
-    """Return random numbers that depend on `seed`, `number` and the kind of device; a CPU takes the lowest 32 bits of
-    what is made of both."""
+    """Return random numbers that depend on `seed`, `number` and the kind of device."""
     return torch.Generator(device).manual_seed((seed * 1_000_003 + number) & 0x7FFF_FFFF_FFFF_FFFF)
 
 
 def eval_background(config: TrainConfig, device: torch.device | str) -> Tensor | None:
-    """Choose the background colour [3] for evaluation, None: black. It is that of training, or `config.alpha_color` if
-    training uses random colours, so that metrics are not random."""
+    """Choose the background colour [3] for evaluation, None: black: that of training, or `config.alpha_color` if that
+    is random."""
     kind = config.background if config.background in ("black", "white") else config.alpha_color
     return torch.ones(3, device=device) if kind == "white" else None
 
 
 def over_background(image: Tensor, background: Tensor | None) -> Tensor:
-    """Compose an image with alpha over a colour [3] (None: black): [H, W, 3]; returns one without alpha unchanged."""
+    """Compose an image, with or without alpha, over a colour [3] (None: black): [H, W, 3]."""
     if image.shape[-1] == 3:
         return image
     color = image[..., :3] * image[..., 3:]
@@ -208,10 +205,8 @@ def over_background(image: Tensor, background: Tensor | None) -> Tensor:
 
 
 def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
-    """Move a view to a device and downscale its image to the size of `camera`, the view's camera scaled.
-
-    The image may have that size already. Raises ValueError: image, mask, depth or normals have the size of neither
-    camera."""
+    """Move a view to a device and downscale it to the size of `camera`, its camera scaled, unless it has that already.
+    Raises ValueError: image, mask, depth or normals have the size of neither camera."""
     image = as_float(view.image.to(device))
     for what in ("image", "mask", "depth", "normal"):
         picture = getattr(view, what)
@@ -232,13 +227,12 @@ def at_size(view: View, camera: Camera, device: torch.device | str) -> View:
 class DownscaledViews:
     """Training views at the current resolution; downscaled images are cached until the resolution changes.
 
-    On the CPU the cache holds `DOWNSCALED_BYTES`. On a CUDA device full-size and downscaled images share one budget;
-    images beyond it are copied at every use.
+    On a CUDA device full-size and downscaled images share one budget; images beyond it are copied at every use.
 
     Args:
         device: of the returned images.
-        correction: returns the current correction of a view by its index; None: the view's own.
-        pose: returns a view's camera, by its index, with the current pose; None: poses are fixed.
+        correction: current correction of a view by its index; None: its own.
+        pose: camera of a view, by its index, with the current pose; None: poses are fixed.
         resident_bytes: budget on a CUDA device; None: `photograph_budget`.
     """
 
@@ -260,14 +254,13 @@ class DownscaledViews:
         if resident_bytes is None:
             resident_bytes = photograph_budget(self._device)
         self._budget = MemoryBudget(resident_bytes)
-        # on a GPU one budget for both: full-size images stay, downscaled ones free theirs when the resolution changes
         self._reduced_budget = self._budget if resident_bytes else MemoryBudget(DOWNSCALED_BYTES)
 
     def __len__(self) -> int:
         return len(self._views)
 
     def at(self, index: int, factor: float) -> View:
-        """Return view `index`, its image resized by `factor`, with its current correction and pose."""
+        """Return view `index`, resized by `factor`, with its current correction and pose."""
         view = self._at(index, factor)
         if self._pose is not None:
             view = view._replace(camera=self._pose(index, view.camera))
@@ -300,21 +293,19 @@ class DownscaledViews:
         return moved
 
     def draw(self, k: int, generator: torch.Generator, factor: float) -> Sequence[View]:
-        """Sample `k` different views, or all if there are fewer, downscaled on access; `generator` is on the CPU."""
+        """Sample at most `k` different views, downscaled on access."""
         order = torch.randperm(len(self), generator=generator).tolist()[:k]
         return OnDemand(len(order), lambda i: self.at(order[i], factor))
 
 
 def photograph_budget(device: torch.device) -> int:
-    """Compute the bytes of photographs to cache on a CUDA device: a quarter of its free memory; 0 for the CPU."""
+    """Return the bytes of photographs to cache: a quarter of a CUDA device's free memory; 0 for the CPU."""
     return torch.cuda.mem_get_info(device)[0] // 4 if device.type == "cuda" else 0
 
 
 def training_order(n: int, seed: int, step: int) -> int:
-    """Compute the index of the view at position `step` of the training order: each view once per epoch, reshuffled.
-
-    Depends only on the arguments, so that a resumed run uses the same views.
-    """
+    """Compute the index of the view at position `step` of the training order: each once per epoch, reshuffled. Depends
+    only on the arguments: a resumed run uses the same views."""
     epoch, position = divmod(step, n)
     return _order(n, seed, epoch)[position]
 
@@ -329,17 +320,12 @@ T = TypeVar("T")
 
 class MemoryBudget:
     """Byte budget shared by caches, first come, first served: views are used cyclically, so evicting the oldest would
-    drop each view just before its next use.
-
-    Attributes:
-        left: bytes not reserved.
-    """
+    drop each just before its next use. `left`: bytes not reserved."""
 
     def __init__(self, nbytes: int) -> None:
         self.left = nbytes
 
     def reserve(self, nbytes: int) -> bool:
-        """Reserve bytes; False if too few are left."""
         if nbytes > self.left:
             return False
         self.left -= nbytes
@@ -347,11 +333,7 @@ class MemoryBudget:
 
 
 class OnDemand(Sequence[T]):
-    """A sequence that creates its items at each access.
-
-    Args:
-        make: creates the item of an index, 0 to count - 1.
-    """
+    """A sequence that makes its items, 0 to count - 1, at each access."""
 
     def __init__(self, count: int, make: Callable[[int], T]) -> None:
         self._indices, self._make = range(count), make

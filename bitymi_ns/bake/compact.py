@@ -1,4 +1,4 @@
-"""Rate-distortion choice of the codes of a compact bundle: one lambda decides the precision of everything."""
+"""Rate-distortion choice of the codes of a compact bundle, by one lambda for everything."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -23,28 +23,27 @@ from .tuning_views import TexelList
 
 START = 8.0 / 255**2  # first lambda of the search: squared error per bit, colours from 0 to 1
 MAX_LAMBDA = 4.0 / 255**2
-"""Largest lambda where `Compact.share` decides. A large error that texels cannot correct, as of exposure, would allow
-much rounding, but does not hide it; and texels learn little with steps above the 4.2 of 255 that this lambda gives."""
-TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned after it, as a share of that of everything else
+"""Largest lambda where `Compact.share` decides: large errors that texels cannot correct, as of exposure, do not hide
+rounding, and texels learn little with steps above the 4.2 of 255 that this lambda gives."""
+TEXEL_SHARE = 0.5  # lambda of the texels, which are tuned later, as a share of that of all else
 ENOUGH = 0.002
-"""Added error, as a share of the bake's (0.009 dB), below which precision is not worth bytes that a size allows."""
-LEAST_ERROR = 1e-7  # mean square error that is always allowed, of colours from 0 to 1: 70 dB
+"""Added error, as a share of the bake's (0.009 dB), below which a given size is not used up."""
+LEAST_ERROR = 1e-7  # mean square error that is always allowed: 70 dB
 MANIFEST_BYTES = 28_000  # upper estimate of bundle.json and config.yml
 ALTERNATIVES = {0.5: 12.0, 2.0: 1.0 / 32}
-"""Bytes, relative to the chosen ones, of the precisions that are stated beside, and first factors of lambda to try."""
+"""Relative bytes of the precisions that are stated beside, and first factors of lambda to try."""
 _SEARCH, _TRIES = 7, 4
-_CLOSE = 1.1  # largest ratio of the bytes of an alternative to those wanted, either way
+_CLOSE = 1.1  # largest ratio of the bytes of an alternative to those wanted, or inverse
 
 
 @dataclass(frozen=True)
 class Compact:
     """Size and precision of a compact bundle.
 
-    `share`: how much it may add to the mean square error of the pictures against the training photographs, as a share
-    of it, before the texels are tuned; less where lambda would exceed `MAX_LAMBDA`. `most_bytes` of surfels and texels,
-    not used up where the added error is below `ENOUGH`, or `psnr` in dB on the training photographs, which the smallest
-    bundle must reach before the texels are tuned, decides instead where it is given. `views`: training views that are
-    drawn, spread over all."""
+    `share`: what may be added, before the texels are tuned, to the mean square error against the training photographs,
+    as a share of it; less where lambda would exceed `MAX_LAMBDA`. Instead decide, where given, `most_bytes` of surfels
+    and texels, not used up where the added error is below `ENOUGH`, or `psnr`, dB, which the smallest bundle must reach
+    before the texels are tuned. `views`: number of training views that are drawn."""
 
     share: float = 0.1
     most_bytes: int | None = None
@@ -52,9 +51,8 @@ class Compact:
     views: int = 8
 
     def fitting(self, megabytes: float, beside: int) -> "Compact":
-        """Limit all files to `megabytes` (10^6 bytes), of which files beside the scene, its poster, bundle.json and
-        config.yml take `beside` bytes. Raises ValueError: it is out of range, or leaves nothing for surfels and
-        texels."""
+        """Limit all files to `megabytes` (10^6 bytes), of which those beside surfels, texels, poster, bundle.json and
+        config.yml take `beside` bytes. Raises ValueError: it is out of range, or leaves nothing for the scene."""
         if not 0.01 <= megabytes <= 1e5:
             raise ValueError(f"a bundle takes from 0.01 to 100,000 MB, not {megabytes}")
         size = int(1e6 * megabytes)
@@ -69,10 +67,10 @@ class RatePoint:
     """A point of the rate-distortion curve."""
 
     lmbda: float  # squared error per bit
-    baked: Rounded  # its texels are as they were
-    texels: TexelCodes | None  # codes of its texels; None without
-    error: float  # mean square error against the training photographs
-    psnr: float  # on them, dB
+    baked: Rounded  # with texels as they were
+    texels: TexelCodes | None  # None without texels
+    error: float  # mean square error against the photographs
+    psnr: float  # dB
 
     @cached_property
     def bytes(self) -> int:
@@ -82,7 +80,7 @@ class RatePoint:
 
 
 class Coder:
-    """Measurements of a bake from which every point of its rate-distortion curve follows."""
+    """Measurements of a bake that give every point of its rate-distortion curve."""
 
     def __init__(
         self,
@@ -93,8 +91,8 @@ class Coder:
         progress: Progress = no_progress,
         held_out: Sequence[View] = (),
     ) -> None:
-        """Measure `baked`, with reduced view colours, in the training views; without any the reference steps are taken.
-        Alternatives are stated on the `held_out` views, without any on the training views. `background`: [3]."""
+        """Measure `baked` in the training views; without any the reference steps are taken. Alternatives are stated on
+        the `held_out` views, or without any on the training views. `background`: [3]."""
         self._baked, self._pictures = baked, Pictures(views, background, options.views, baked.device)
         self._held_out = Pictures(held_out, background, options.views, baked.device)
         scene = baked.unquantised()
@@ -115,7 +113,7 @@ class Coder:
         return self._pictures.views > 0
 
     def allowed(self, share: float) -> float:
-        """Compute the allowed mean square error: (1 + share) x that of the bake."""
+        """Compute the allowed mean square error."""
         return self.error + max(LEAST_ERROR, share * self.error)
 
     def _view_colors(self, lmbda: float) -> dict[str, Tensor]:
@@ -123,8 +121,8 @@ class Coder:
 
     @torch.no_grad()
     def at(self, lmbda: float, held_out: bool = False) -> RatePoint:
-        """Round and code everything at a lambda: squared error per bit, colours from 0 to 1, summed over the pixels
-        and channels of all views. `held_out`: state error and PSNR of held-out views, if there are any."""
+        """Round and code everything at a lambda: squared error per bit, summed over pixels and channels of all views.
+        `held_out`: error and PSNR are of the held-out views, if there are any."""
         baked, pictures = self._baked, self._held_out if held_out and self._held_out.views else self._pictures
         surfels = {**baked.scene.surfels, **self._view_colors(lmbda)}
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
@@ -163,8 +161,8 @@ def compacted(
     progress: Progress = no_progress,
     held_out: Sequence[View] = (),
 ) -> Rounded:
-    """Round the surfels of a bake to the values of a compact bundle, in Morton order, and choose the coding of the
-    texels. Arguments as of `Coder`. Raises ValueError: the target cannot be reached."""
+    """Round the surfels of a bake for a compact bundle, in Morton order, and choose the coding of the texels. Arguments
+    as of `Coder`. Raises ValueError: the target cannot be reached."""
     options = options or Compact()
     coder = Coder(baked, views, background, options, progress, held_out)
     if options.most_bytes is not None:
@@ -184,8 +182,8 @@ def compacted(
     elif options.psnr is not None:
         if coder.psnr < options.psnr:
             raise ValueError(
-                f"the bake shows the training photographs at {coder.psnr:.2f} dB, so {options.psnr:g} dB cannot be "
-                "reached: ask for less, or train for longer"
+                f"the bake shows the training photographs at {coder.psnr:.2f} dB, not at {options.psnr:g} dB: ask for "
+                "less, or train for longer"
             )
         lost = max(1e-6, coder.psnr - options.psnr)
         chosen, _ = _search(coder, lambda point: (coder.psnr - point.psnr) / lost, progress)
@@ -201,7 +199,7 @@ def compacted(
 
 
 def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | None]] | None:
-    """Measure bytes and PSNR at about half and twice the bytes, relative to the chosen; None without views."""
+    """Measure relative bytes and PSNR at about half and twice the bytes; None without views."""
     if not coder.measured:
         return None
     alternatives, base = [], coder.at(chosen.lmbda, held_out=True).psnr
@@ -224,9 +222,9 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | 
 def _search(
     coder: Coder, excess: Callable[[RatePoint], float], progress: Progress, most: float = math.inf
 ) -> tuple[RatePoint, RatePoint]:
-    """Bisect lambda up to `most`, until the excess is 0.9 to 1: the last passing point (excess at most 1) and the first
-    failing one, or the nearest that was tried. A finite excess above 0 is about proportional to lambda, and gives the
-    next one."""
+    """Bisect lambda up to `most`, until the excess is 0.9 to 1: the last passing point (at most 1) and the first
+    failing one, or the nearest tried. A finite excess above 0 is about proportional to lambda, and gives the next
+    one."""
     low, high, points = None, None, {}
     lmbda = min(START, most)
     for step in range(_SEARCH):
@@ -247,7 +245,7 @@ def _search(
 
 
 def _thinned(baked: Rounded) -> ViewColorError | None:
-    """Update the statistics of the view colours to the terms that are left; the error stays that of their reduction."""
+    """Update the statistics of the view colours to the terms that are left, except the error."""
     stated, surfels = baked.statistics.view_color, baked.scene.surfels
     if stated is None:
         return None

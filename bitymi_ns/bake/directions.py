@@ -1,4 +1,4 @@
-"""Directions at which a surfel's view colour is evaluated: of the training views that show it, and others nearby."""
+"""Directions at which view colours are evaluated: of the training views that show a surfel, and others nearby."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -10,8 +10,8 @@ from torch.nn import functional as F
 from bitymi_ns.ops.view_kinds import fibonacci_sphere
 
 BETWEEN = 32  # directions between and around those of the views
-SPHERE = 64  # directions over the whole sphere for a surfel that no view sees
-_REACH = 1.25  # a quarter farther out than the triangle of three views
+SPHERE = 64  # directions over the sphere for a surfel that no view sees
+_REACH = 1.25  # size relative to the triangle of three views
 _CHUNK = 1 << 19  # directions at once
 
 
@@ -20,24 +20,23 @@ class Directions:
     """Directions of some surfels."""
 
     rows: Tensor  # [n] int64 rows of the surfels
-    unit: Tensor  # [n, D, 3] float32 unit vectors from the camera to the surfel, world frame; those of the views first
+    unit: Tensor  # [n, D, 3] float32 unit vectors from camera to surfel, world frame; those of the views first
     valid: Tensor  # [n, D] bool; False: padding
-    views: int  # number of the D columns that are for views
-    view: Tensor  # [n, views] int64, view of each of these columns
+    views: int  # number of columns for views
+    view: Tensor  # [n, views] int64, their views
 
     def subset(self, values: Tensor, most: int) -> Tensor:
-        """Select columns of `values` [n, D, ...]: at most `most` views, evenly, and every other one of the rest."""
+        """Select columns of `values` [n, D, ...]: at most `most` views, evenly, and every other of the rest."""
         stride = -(-self.views // most) if self.views else 1
         return torch.cat([values[:, : self.views : stride], values[:, self.views :: 2]], dim=1)
 
 
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
-    """Yield the directions of all surfels, in chunks of surfels that about equally many views see.
+    """Yield the directions of all surfels, in chunks that about equally many views see.
 
     A surfel has the directions of the views that see it and BETWEEN others: random points of triangles between three of
-    these, each triangle enlarged by a quarter, with the same random numbers for every surfel. A surfel that no view
-    sees has SPHERE directions. `means`: [N, 3], world. `seen`: [V, N] bool. `centers`: [V, 3] float64 camera centres,
-    world."""
+    these, enlarged by a quarter, with the same random numbers for every surfel. A surfel that no view sees has SPHERE
+    directions. `means`: [N, 3], `centers`: [V, 3] float64 of the cameras, world. `seen`: [V, N] bool."""
     count = seen.sum(0)  # [N]
     order = torch.argsort(count, stable=True)
     unseen = int((count == 0).sum())

@@ -13,17 +13,16 @@ from bitymi_ns.train.views import OnDemand, View
 
 S = TypeVar("S")
 
-FEWEST_VIEWS = 4  # with fewer views nothing is optimised, except by `tune_atlas` without validation
+FEWEST_VIEWS = 4  # with fewer nothing is optimised, except by `tune_atlas` without validation
 
 
 class EarlyStopping(Generic[S]):
     """Best state by the PSNR of validation views: `best` is the state with the highest PSNR, the first included, or
-    without validation views the last; `curve` has (step, dB) of every evaluation, `done` the steps before the last
-    one."""
+    without validation views the last; `curve` has (step, dB) of every evaluation, `done` the steps before the last."""
 
     def __init__(self, steps: int, checks: int, patience: int, psnr: float, first: S) -> None:
-        """Begin with a state and the PSNR of the views before the first step, dB; NaN without any. `steps`: maximum
-        number. `checks`: evaluations over the run. `patience`: evaluations without a gain before the end."""
+        """`steps`: maximum number. `checks`: evaluations over the run. `patience`: evaluations without a gain before
+        the end. `psnr`: dB before the first step; NaN without views. `first`: state then."""
         self._steps, self._patience = steps, patience
         self._every = max(1, -(-steps // checks))
         self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
@@ -32,8 +31,8 @@ class EarlyStopping(Generic[S]):
         return done % self._every == 0 or done == self._steps
 
     def update(self, done: int, psnr: float, state: Callable[[], S]) -> bool:
-        """Record an evaluation after a step; return False where the last `patience` evaluations were all worse than the
-        best. `psnr`: of the views, dB; NaN without any. `state`: makes a copy of the state."""
+        """Record an evaluation after a step; return False where the last `patience` ones were all worse than the best.
+        `psnr`: dB; NaN without views. `state`: makes a copy of the state."""
         self.done = done
         if math.isnan(psnr):
             self.best = state()
@@ -63,8 +62,8 @@ class EarlyStopping(Generic[S]):
 def evaluate(
     pictures: Iterable[tuple[Tensor, Tensor, Tensor | None]], count: int, progress: Progress = no_progress
 ) -> float:
-    """Average the PSNR, dB, over views with an unmasked pixel. `pictures`: rendering and photograph [H, W, 3] of every
-    view, and the mask of the pixels that count; made one by one."""
+    """Average the PSNR, dB, over `count` views with an unmasked pixel. `pictures`: rendering, photograph [H, W, 3] and
+    mask."""
     values = []
     for rgb, target, mask in pictures:
         values.append(psnr(rgb.clamp(0.0, 1.0), target, mask))
@@ -77,7 +76,7 @@ def gain(before: float, after: float) -> Gain:
 
 
 def validation_split(views: Sequence[View], every: int) -> tuple[Sequence[View], Sequence[View]]:
-    """Split into validation views, every `every`-th (0: none), and training views; each is read on access."""
+    """Split into validation views, every `every`-th (0: none), and training views, read on access."""
     rows = range(len(views))
     parts = [i for i in rows if every and i % every == 0], [i for i in rows if not every or i % every]
     validation, trained = (OnDemand(len(part), lambda i, part=part: views[part[i]]) for part in parts)

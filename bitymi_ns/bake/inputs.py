@@ -1,4 +1,4 @@
-"""Inputs of the bake: the surfels, the training cameras, and what these see."""
+"""Inputs of the bake: surfels, training cameras, and what these see."""
 
 from __future__ import annotations
 
@@ -12,13 +12,11 @@ from bitymi_ns.ops import TexelAlpha
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.visibility import Visibility
 
-POINTS = 256  # points of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame
+POINTS = 256  # of `photo_resolution`; each takes 22 bytes of bundle.json, and time in every frame
 
 
 @dataclass(frozen=True)
 class BakeInput:
-    """Surfels and the views of them."""
-
     surfels: Mapping[str, Tensor]  # per-surfel parameters by name, N rows, float32
     cameras: Sequence[Camera]  # training views; there may be none
     # near, weight_bound: as the scene is drawn
@@ -40,10 +38,9 @@ class BakeInput:
 
 
 def photo_resolution(inputs: BakeInput) -> Tensor | None:
-    """Sample the resolution of the photographs at points of the scene (`scene/sampling.py`): [P, 4] float32 on the CPU,
-    positions of surfels, evenly chosen from those that views show, and the geometric mean over these views of focal
-    length / depth, pixels per unit; None without views. Without visibility, a view shows the surfels whose centres
-    project into its image."""
+    """Sample the resolution of the photographs (`scene/sampling.py`): [P, 4] float32 on the CPU, positions of surfels
+    that views show, and the geometric mean over these views of focal length / depth, pixels per unit; None without
+    views. Without visibility, a view shows the surfels whose centres project into its image."""
     if not inputs.cameras:
         return None
     means = inputs.surfels["means"]

@@ -1,4 +1,4 @@
-"""From a trained scene and its photographs to the contents of a bundle, stage by stage."""
+"""From a trained scene and its photographs to a bundle, stage by stage."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ from .tune import TuneOptions, tune_atlas
 
 @torch.no_grad()
 def trained_texels(scene: BakeableScene, options: BakeOptions) -> Trained:
-    """Bake a scene whose texels were trained, or has none: all of its tiles, view colours and drawable surfels, for
-    `prune_and_resample`. Raises ValueError: no surfel is left, or the atlas would be too large."""
+    """Take drawable surfels with all view colours and trained tiles, if any, from a scene. Raises ValueError: no surfel
+    is left, or the atlas would be too large."""
     rows, left_out = drawable(scene.surfels)
     trained = len(scene.surfels["means"])
     if len(rows) == 0:
@@ -57,20 +57,18 @@ def trained_texels(scene: BakeableScene, options: BakeOptions) -> Trained:
     return replace(stage, texel_counts={"learned": stage.packing.texels}) if learned else stage
 
 
-FEWEST_PASSES = 4  # steps of polish or fine-tuning per photograph; more may gain where there are fewer
-STEPS_AFTER_LEARNING = 100
-"""Fine-tuning steps of texels that were trained already: they recover what the reduction of tiles and colours cost."""
+FEWEST_PASSES = 4  # steps of polish or fine-tuning per photograph below which more may gain
+STEPS_AFTER_LEARNING = 100  # fine-tuning steps of trained texels, which recover what the reduction cost
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Optimisation after the training, against the photographs."""
+    """Optimisation after the training."""
 
     polish: PolishOptions | None = None  # of texels and surfels together; None = none
     tune: TuneOptions | None = None  # of texels alone, after that; None = none
-    train: TrainConfig = dataclasses.field(
-        default_factory=TrainConfig
-    )  # options of the training, for the rates of the polish
+    # options of the training, for the rates of the polish
+    train: TrainConfig = dataclasses.field(default_factory=TrainConfig)
     compact: Compact | None = None  # rounding for a compact bundle, before the texels are tuned alone; None = none
 
     @classmethod
@@ -84,11 +82,10 @@ class RefineOptions:
         train: TrainConfig | None = None,
         compact: Compact | None = None,
     ) -> RefineOptions:
-        """Choose the steps by the kind of the scene's texture: texels, a field, or none, which nothing refines.
+        """Choose the steps by the kind of texture.
 
-        `polish_steps`: 0 = no polish; None = none for texels, which training has learned; for a field 300, or
-        `FEWEST_PASSES` for each photograph where that is more. `tune_steps`: 0 = no fine-tuning; None =
-        `STEPS_AFTER_LEARNING`, or 400 where a field is not polished."""
+        `polish_steps`: 0 = none; None = none for trained texels; for a field 300, or `FEWEST_PASSES` per photograph if
+        more. `tune_steps`: 0 = none; None = `STEPS_AFTER_LEARNING`, or 400 where a field is not polished."""
         train = TrainConfig() if train is None else train
         if scene.field is None:
             return cls(train=train, compact=compact)
@@ -113,14 +110,13 @@ def bake(
     progress: Progress = no_progress,
     held_out: Sequence[View] = (),
 ) -> Coded:
-    """Bake a trained scene, optimise it against the photographs, and encode it for a bundle; the scene's device does
-    the work.
+    """Bake a trained scene, optimise it against the photographs, and encode it for a bundle, on the scene's device.
 
     Stages: tiles of the trained texels, or of the field; polish of texels and surfels (field only); reduction of tiles
     and view colours; rounding of the surfels (compact only); fine-tuning of the texels; coding; certificate.
-    `photographs`: the training views, with the corrections that training found; `cameras`: theirs. `background`: [3].
-    `held_out`: views of which the gains are stated; they decide nothing. Raises ValueError: no surfel is left, an
-    option is out of range or for a field alone, or the atlas would be too large."""
+    `photographs`: training views, with the corrections of training; `cameras`: theirs. `background`: [3]. `held_out`:
+    views of which gains are stated. Raises ValueError: no surfel is left, an option is out of range or for a field
+    alone, or the atlas would be too large."""
     options.check()
     of_fields = ("r_min", "r_max", "extent", "local_voxel")
     given = [name for name in of_fields if getattr(options, name) != getattr(BakeOptions, name)]

@@ -1,4 +1,4 @@
-"""Quantisation steps of the surfels' columns from the image error of rounding each, measured by drawing."""
+"""Quantisation steps of the surfels' columns from the image error of rounding each."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,19 +16,17 @@ from bitymi_ns.train.losses import psnr
 from bitymi_ns.train.views import View
 
 WIDEST, NARROWEST = 4.0, 1.0 / 64
-"""Range of the steps, as multiples of the reference steps; beyond it, errors are not proportional to steps."""
+"""Range of the steps, as multiples of the reference steps: beyond, errors are not proportional to them."""
 PER_BIT = 2.0 * math.log(2.0)  # relative fall, per bit, of an error proportional to the square of a step
 
 
 class Pictures:
-    """Training views sampled for the comparison of renderings with photographs: how many there are, and how many colour
-    values (`numbers`) their unmasked pixels have, three each."""
+    """Sample of the training views, for comparison with renderings; `numbers`: of colour values in unmasked pixels."""
 
     def __init__(
         self, views: Sequence[View], background: Tensor, most: int, device: torch.device | str = "cpu"
     ) -> None:
-        """Take up to `most` of the training views that have an unmasked pixel, spread over all. `background`: [3]
-        colour behind the scene."""
+        """Take up to `most` of the views with an unmasked pixel, spread over all. `background`: [3]."""
         taken = [views[i] for i in range(0, len(views), max(1, math.ceil(len(views) / most)))]
         chosen = [*filter(_counts, taken)] or [*islice(filter(_counts, views), most)]
         self._device, self._background = device, background.to(device)
@@ -40,7 +38,7 @@ class Pictures:
         self.numbers = sum(counts)
 
     def of(self, scene: BakedScene) -> list[Tensor]:
-        """Draw the views [H, W, 3] with the exposure of their photographs."""
+        """Draw the views [H, W, 3] with the corrections of their photographs."""
         scene = scene.to(self._device)
         drawn = [(view, scene.render(view.camera, self._background)) for view in self._views]
         return [view.shown(d.rgb, d.alpha, self._background).clamp(0.0, 1.0) for view, d in drawn]
@@ -61,15 +59,13 @@ def _counts(view: View) -> bool:
 
 @dataclass(frozen=True)
 class ColumnNoise:
-    """Image error of rounding, for each column of `REFERENCE`."""
-
     noise: Mapping[str, float]  # mean square error of the pictures over the squared step; 0 = not visible
     counts: Mapping[str, int]  # numbers of the column
 
     def steps(self, lmbda: float) -> dict[str, float]:
-        """Choose the steps at which one more bit per number of a column lowers the error by lambda per bit: a column
-        whose step is s adds D s^2 to the mean square error, and halving s takes a bit per number. `lmbda`: mean square
-        error of the images per bit; 0 = unknown: take the reference steps."""
+        """Choose the steps at which one more bit per number of a column lowers the error by lambda: a column of step s
+        adds D s^2 to the mean square error, and halving s takes a bit per number. `lmbda`: mean square error per bit; 0
+        = unknown: take the reference steps."""
         if lmbda == 0:
             return dict(REFERENCE)
         return {name: _step(name, lmbda * self.counts[name] / PER_BIT, self.noise[name]) for name in REFERENCE}

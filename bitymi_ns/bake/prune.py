@@ -1,4 +1,4 @@
-"""Reduction of a bake: invisible and unstorable surfels are dropped, tiles and view colours reduced."""
+"""Reduction of a bake: surfels are dropped, tiles and view colours reduced."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ from .view_colors import reduce_view_colors
 
 
 def drawable(surfels: Tensors) -> tuple[Tensor, Counter[str]]:
-    """Find the rows [N] int64 that can be drawn and stored; count those left out, by field of `LeftOut`."""
+    """Find the rows, int64, that can be drawn and stored; count those left out, by field of `LeftOut`."""
     finite = torch.stack([value.isfinite().unsqueeze(-1).flatten(1).all(1) for _, value in surfels.items()]).all(0)
     scales = surfels["log_scales"].exp()
     finite &= torch.isfinite(scales).all(1) & (scales > 0).all(1)
@@ -38,9 +38,8 @@ def drawable(surfels: Tensors) -> tuple[Tensor, Counter[str]]:
 def drop_unseen(
     baked: Trained, cameras: Sequence[Camera], progress: Progress = no_progress
 ) -> tuple[Trained, BakeInput]:
-    """Leave out, and count, the surfels that cannot be drawn or stored and, if the options say so, those that no view
-    blends. Also returns the kept surfels and their visibility, on the bake's device. Raises ValueError: none is
-    left."""
+    """Leave out, and count, surfels that cannot be drawn or stored and, by option, those that no view blends. Also
+    returns the kept surfels and their visibility, on the bake's device. Raises ValueError: none is left."""
     scene, device = baked.scene, baked.device
     rows, gone = drawable(scene.surfels)
     surfels = {name: value[rows].to(device) for name, value in scene.surfels.items()}
@@ -63,7 +62,7 @@ def drop_unseen(
 
 @torch.no_grad()
 def prune_and_resample(baked: Trained, cameras: Sequence[Camera], progress: Progress = no_progress) -> Reduced:
-    """Drop surfels as `drop_unseen` does, and reduce tiles and view colours by the bake's options."""
+    """Drop surfels (`drop_unseen`), and reduce tiles and view colours by the bake's options."""
     result, inputs = drop_unseen(baked, cameras, progress)
     surfels, colors, view_color = reduce_view_colors(inputs, baked.options, progress)
     if baked.options.tolerance > 0 and result.textured:

@@ -35,7 +35,7 @@ S = TypeVar("S", bound="Stage")
 
 
 class BakeableScene(Protocol):
-    """The part of a scene that the bake uses."""
+    """What the bake uses of a scene."""
 
     @property
     def surfels(self) -> Tensors: ...
@@ -47,20 +47,20 @@ class BakeableScene(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """Surfels with tiles, on the CPU, as every stage has them."""
+    """Surfels with tiles, on the CPU."""
 
     scene: BakedScene  # the N surfels; only a `Coded` one has an atlas
     rows: Tensor  # [N] int64, their rows in the trained scene
-    packing: Packing  # layout of the tiles; shares memory with `scene.tiles`
-    extent: Tensor  # [N] half side of every tile in scale units
-    # [T, C] float32 before coding, in the order of `ops.TexelTiles`: residual colours and, where C = 4, alpha; a
-    # surfel without a tile has one texel, its constant
+    packing: Packing  # shares memory with `scene.tiles`
+    extent: Tensor  # [N] half sides of the tiles, scale units
+    # [T, C] float32 before coding, in the order of `ops.TexelTiles`: residual colours and, where C = 4, alpha; one, its
+    # constant, for a surfel without a tile
     texels: Tensor
     options: BakeOptions
     device: torch.device  # of the trained scene: does the work
     trained: int  # surfels of the scene
-    left_out: Counter[str]  # numbers of those that are not here, by field of `LeftOut`
-    texel_counts: Mapping[str, int]  # by field of `KeptTexels`, those of the scene's kind of texture; empty without one
+    left_out: Counter[str]  # those that are not here, by field of `LeftOut`
+    texel_counts: Mapping[str, int]  # by field of `KeptTexels`; empty without texture
     statistics: Statistics = field(default_factory=Statistics)
 
     @property
@@ -81,11 +81,11 @@ class Stage:
         return TexelAlpha(tiles, self.texels[:, 3].contiguous(), self.scene.weight_bound)
 
     def with_alpha(self, colors: Tensor) -> Tensor:
-        """Append the alphas of the bake, if any, to residual colours [T, 3]: [T, C]."""
+        """Append the alphas, if any, to residual colours [T, 3]: [T, C]."""
         return joined(colors, None if self.alpha is None else self.alpha.values)
 
     def unquantised(self) -> BakedScene:
-        """Make a renderable scene with texels before coding, as 32-bit floats."""
+        """Make a renderable scene with texels before coding."""
         if not self.textured:
             return self.scene
         pages = paged_texels(self.texels, self.packing)
@@ -97,13 +97,13 @@ class Stage:
         return replace(self, statistics=self.statistics.replace(**parts))
 
     def become(self, stage: type[S], **own: Any) -> S:
-        """Go on to another stage with what every stage has; `own`: what differs, and what that stage adds."""
+        """Go on to another stage; `own`: what differs, and what that stage adds."""
         return stage(**{part.name: getattr(self, part.name) for part in fields(Stage)} | own)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Trained(Stage):
-    """Surfels with all terms of their view colours, and tiles as they were trained or read from a field."""
+    """Surfels with whole view colours, and tiles as trained or read from a field."""
 
     def with_surfels(self, surfels: Mapping[str, Tensor]) -> Trained:
         given = {name: value.detach().cpu().contiguous() for name, value in surfels.items()}
@@ -113,12 +113,12 @@ class Trained(Stage):
         return replace(self, **laid_out(self.scene, tiles, self.options))
 
     def with_colors(self, colors: Tensor) -> Trained:
-        """Replace the residual colours of the texels by [T, 3]."""
+        """Replace the residual colours by [T, 3]."""
         texels = self.with_alpha(colors.detach().float().cpu()).contiguous()
         return replace(self, texels=texels, scene=with_means(self.scene, tile_means(texels, self.sizes)))
 
     def only(self, kept: Tensor) -> Trained:
-        """Keep the surfels of a mask [N] and their tiles, laid out again."""
+        """Keep the surfels of a mask [N], with their tiles."""
         if bool(kept.all()):
             return self
         surfels = {name: value[kept] for name, value in self.scene.surfels.items()}
@@ -129,10 +129,10 @@ class Trained(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class Reduced(Stage):
-    """Surfels that views show, with the smallest tiles and the fewest terms of view colours within the tolerance."""
+    """Surfels that views show, with the smallest tiles and view colours within the tolerance."""
 
-    in_front: Tensor  # [N] transmittance in front of the surfels, the weight of errors of their tiles
-    colors: ColorChoices | None  # view colours of fewer terms; None = a tolerance of 0, which keeps all of them
+    in_front: Tensor  # [N] transmittance in front of the surfels
+    colors: ColorChoices | None  # None = whole view colours, of a tolerance of 0
 
     def encoded(self, progress: Progress = no_progress) -> Coded:
         means = tile_means(self.texels, self.sizes)
@@ -152,15 +152,12 @@ class Rounded(Stage):
     """Surfels rounded for a compact bundle, in its order."""
 
     in_front: Tensor  # as of `Reduced`
-    codes: SurfelCodes  # from which the surfels are decoded
-    step: float  # of the texels, see `TexelCoder`
-    most_bytes: int | None = None
-    """Largest size of the texels with their residuals and mean alphas; the step grows until they fit. None: no
-    limit."""
-    fill: bool = False  # the step also shrinks during fine-tuning, until nearly `most_bytes` are used
+    codes: SurfelCodes  # of the surfels
+    step: float  # of the texels (`TexelCoder`)
+    most_bytes: int | None = None  # of texels, residuals and mean alphas: the step grows until they fit
+    fill: bool = False  # the step also shrinks in fine-tuning, until nearly `most_bytes` are used
     alpha_codes: TexelCodes | None  # codes whose alphas and grades are kept; None = opaque
-    # [T, 2] in pixels, the sums over views and fragments of w b and w^2 b, with blending weight w and bilinear weight b
-    coverage: Tensor
+    coverage: Tensor  # [T, 2], see `TexelList.coverage`
 
     def encoded(self, progress: Progress = no_progress) -> Coded:
         """Code the texels, all with the same weight."""
@@ -183,7 +180,7 @@ class Rounded(Stage):
 
 @dataclass(frozen=True, kw_only=True)
 class Coded(Stage):
-    """Texels as they are stored: `scene` is what a reader draws."""
+    """Texels as stored: `scene` is what a reader draws."""
 
     in_front: Tensor  # as of `Reduced`
     shown: Tensor  # [T, C] the stored texels, decoded
@@ -194,7 +191,7 @@ class Coded(Stage):
 def _coded(
     stage: Reduced | Rounded, means: Tensor, stored: tuple[Atlas, Tensor] | None = None, codes: SceneCodes | None = None
 ) -> Coded:
-    """Go on to `Coded` with means [N, C] of the tiles. `stored`: the atlas and its pages; None = no tiles."""
+    """Go on to `Coded` with means [N, C] of the tiles. `stored`: atlas and pages; None = no tiles."""
     own = {"in_front": stage.in_front, "codes": codes}
     scene = with_means(stage.scene, means.clamp(-RESIDUAL_LIMIT, RESIDUAL_LIMIT))
     if stored is None:
@@ -223,8 +220,8 @@ def export(
     first: Camera | None = None,
     **options: Any,
 ) -> Bundle:
-    """Write a bundle; returns and raises as `write_bundle`. `statistics`: added to those of the bake. `first`: camera
-    with which viewers start, for the poster; None = no poster."""
+    """Write a bundle, as `write_bundle`. `statistics`: added to those of the bake. `first`: first camera of viewers,
+    for the poster; None = no poster."""
     return write_bundle(
         folder,
         baked.scene,
@@ -244,7 +241,7 @@ def with_means(scene: BakedScene, means: Tensor) -> BakedScene:
 
 
 def laid_out(scene: BakedScene, tiles: Tiles, options: BakeOptions) -> dict[str, Any]:
-    """Lay out the tiles of a scene's surfels: the fields of a `Stage` that follow."""
+    """Lay out tiles: the fields of a `Stage` that follow."""
     packing = pack(tiles.sizes, options.page_width, options.page_rows)
     scene = replace(scene, tiles=torch.from_numpy(packing.tiles), extent=tiles.extent)
     scene = with_means(scene, tile_means(tiles.texels, tiles.sizes))
@@ -258,7 +255,7 @@ def encoded_texels(
     progress: Progress = no_progress,
     value_range: Range | None = None,
 ) -> EncodedAtlas:
-    """Encode texels [T, C] in pages as the options say; the range of values is chosen if it is None."""
+    """Encode texels [T, C] in pages; the range of values is chosen if it is None."""
     if options.texel_format != "fp16" and value_range is None:
         value_range = _range_of(texels, packing, options)
     pages = paged_texels(texels, packing).numpy()

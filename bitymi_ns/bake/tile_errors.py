@@ -1,5 +1,5 @@
-"""Errors of texels as the closest training view shows them (times the blending weight, averaged over each pixel), and
-the certificate of a bake, which states those due to quantisation."""
+"""Errors of texels as the closest training view shows them: times the blending weight, averaged over each pixel; and
+the certificate of a bake, which states those of quantisation."""
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
@@ -23,12 +23,11 @@ _CONSTANT = (8, 8)  # grid on which the weight of a surfel without a tile is eva
 def listed_errors(
     difference: Tensor, sizes: Tensor, shown: TileVisibility, chunk: int = 1 << 18
 ) -> tuple[Tensor, Tensor]:
-    """Measure differences [T, 3] of texels, in the order of `ops.TexelTiles` with one texel for a surfel without a
-    tile, as the closest training view shows them. `sizes`: [N, 2] sides of the tiles; (0, 0) = none. `shown`: N rows.
-    `chunk`: texels taken at once (a tile is never split).
+    """Measure differences [T, 3] of texels (`Stage.texels`) as the closest training view shows them. `sizes`: [N, 2] of
+    the tiles; (0, 0) = none. `shown`: N rows. `chunk`: texels taken at once.
 
-    Returns [N] root mean squares, in 8-bit steps, of the differences times the largest blending weight of a fragment at
-    the texel; and [N] bool, whether any fragment of the surfel gets a residual."""
+    Returns [N] root mean squares, 8-bit steps, of the differences times the largest blending weight at the texel; and
+    [N] bool, whether any fragment of the surfel gets a residual."""
     errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
     first, bare = first_texels(sizes), torch.nonzero(sizes[:, 0] == 0).squeeze(1)
     constants = (
@@ -43,15 +42,15 @@ def listed_errors(
 
 
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
-    """Compute the pixels per scale unit [N, 2] of every surfel along u and v in the view that shows it largest; 0 if no
-    view shows it: its square of half side `extent`, in scale units, does not meet the image. `near`: camera z."""
+    """Compute the pixels per scale unit [N, 2] along u and v in the view that shows a surfel largest; 0 if its square
+    of half side `extent`, scale units, meets no image. `near`: camera z."""
     at = (surfels["means"], tangents(surfels["quats"]), surfels["log_scales"].exp())
     return max_projected_extent(*at, cameras, extent, near) / (2.0 * extent)
 
 
 def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) -> Tensor:
-    """Compute how many cells [n, 2] along u and v a pixel of the closest view covers, for tiles `rows` with a grid of
-    `size` (u, v) each, from 1 to the side of the grid; 1 if the view is unknown."""
+    """Compute how many cells [n, 2] of a grid of `size` (u, v) a pixel of the closest view covers in tiles `rows`, from
+    1 to the side of the grid; 1 if the view is unknown."""
     extent = shown.extent[rows]
     sides = torch.tensor(size, dtype=torch.float32, device=extent.device).expand(len(extent), 2)
     if shown.pixels is None:
@@ -61,19 +60,15 @@ def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) 
 
 
 def moving_average(values: Tensor, cells: Tensor) -> Tensor:
-    """Average values over a rectangle about every cell, whose size differs by tile.
-
-    A rectangle that would reach beyond the grid is moved into it. With rectangles of one cell, values stay as they are.
-    `values`: [n, c, v, u]. `cells`: [n, 2] sides of the rectangles along u and v, cells, from 1 to the side of the
-    grid."""
+    """Average values [n, c, v, u] over a rectangle about every cell, moved into the grid. `cells`: [n, 2] sides of the
+    rectangles along u and v, as of `cells_per_pixel`."""
     along_u, along_v = (_windows(values.shape[axis], cells[:, i]) for axis, i in ((3, 0), (2, 1)))
     across = torch.einsum("nij,ncvj->ncvi", along_u, values)
     return torch.einsum("nij,ncju->nciu", along_v, across)
 
 
 def _windows(count: int, width: Tensor) -> Tensor:
-    """Build matrices [n, count, count] of a moving average with windows of `width` [n] cells: every cell's part of
-    them."""
+    """Build matrices [n, count, count] of a moving average with windows of `width` [n] cells."""
     edge, half = torch.arange(count, device=width.device, dtype=torch.float32), width[:, None] / 2
     center = torch.minimum(torch.maximum(edge + 0.5, half), count - half)  # [n, count]
     low, high = (center - half)[:, :, None], (center + half)[:, :, None]
@@ -82,8 +77,8 @@ def _windows(count: int, width: Tensor) -> Tensor:
 
 @torch.no_grad()
 def certified(baked: Coded, cameras: Sequence[Camera]) -> Coded:
-    """State the error of the stored residual colours against those before quantisation, as training views see it, in
-    the statistics; alphas are not covered. A bake without texels, or without a tolerance, is returned as it is."""
+    """State the error of quantised residual colours, as training views see it, in the statistics, without alphas. A
+    bake without texels or tolerance is returned as it is."""
     scene, options = baked.scene, baked.options
     if baked.atlas is None or options.tolerance == 0:
         return baked

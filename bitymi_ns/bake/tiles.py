@@ -1,4 +1,4 @@
-"""Tiles of surfels: where they lie, how much an error of a texel counts, and the smallest grids within a tolerance."""
+"""Tiles of surfels: coordinates and weights of texels, and the smallest grids within a tolerance."""
 
 from __future__ import annotations
 
@@ -24,32 +24,30 @@ class Tiles:
     """Tiles of N surfels on the CPU."""
 
     sizes: Tensor  # [N, 2] sides (r_u, r_v), texels; (0, 0) = no tile
-    extent: Tensor  # [N] half side in scale units
-    # [T, C] in the order of `ops.TexelTiles`, residual colours and, where C = 4, alpha; a surfel without a tile has one
-    texels: Tensor
+    extent: Tensor  # [N] half side, scale units
+    texels: Tensor  # [T, C], as of `Stage`
 
 
 @dataclass
 class TileVisibility:
     """Largest visible part and weight of N tiles."""
 
-    opacity: Tensor  # [N] largest blending weight of the surfel's centre
+    opacity: Tensor  # [N] largest blending weight
     beta: Tensor  # [N] exponent of the kernel
-    # [N] half side of the tile in scale units, beyond which every fragment is below the weight bound; 0 where all are
-    extent: Tensor
+    extent: Tensor  # [N] half side of the tile, scale units
     weight_bound: float  # fragments of smaller weight get no residual
     # [N, 2] pixels per scale unit in the closest view (`tile_errors.closest_pixels`); None = not known
     pixels: Tensor | None = field(default=None, kw_only=True)
 
 
 def texel_centers(count: int, extent: Tensor) -> Tensor:
-    """Compute surfel coordinates [..., count] of the centres of `count` texels along one axis, in scale units and the
-    dtype of the half sides `extent` [..., 1]: (i + 0.5) / count * 2 extent - extent."""
+    """Compute coordinates [..., count] of the centres of `count` texels along one axis, (i + 0.5) / count * 2 extent -
+    extent, scale units; half sides `extent`: [..., 1]."""
     return extent * ((2.0 * torch.arange(count, device=extent.device) + 1.0) / count - 1.0)
 
 
 def grid(count: tuple[int, int], extent: Tensor) -> tuple[Tensor, Tensor]:
-    """Compute surfel coordinates u, v [n, count_v, count_u] of the cell centres of tiles of half sides [n]."""
+    """Compute coordinates u, v [n, count_v, count_u] of the cell centres of tiles of half sides [n]."""
     u, v = (texel_centers(c, extent[:, None]) for c in count)
     return u[:, None, :].expand(-1, count[1], -1), v[:, :, None].expand(-1, -1, count[0])
 
@@ -63,8 +61,8 @@ def weights(shown: TileVisibility, rows: Tensor, count: tuple[int, int]) -> Tens
 
 
 def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
-    """Compute the root mean square [n], in 8-bit steps, of difference [n, C, v, u] times weight [n, v, u], over texels
-    of weight above 0. Alpha, the fourth channel if there is one, is scaled by `ALPHA_CONTRAST`."""
+    """Compute the root mean square [n], 8-bit steps, of difference [n, C, v, u] times weight [n, v, u], over texels of
+    weight above 0; alpha is scaled by `ALPHA_CONTRAST`."""
     count = 3 * (weight > 0).flatten(1).sum(1).clamp(min=1)
     squares = difference[:, :3].square().sum(1)
     if difference.shape[1] == 4:
@@ -73,13 +71,13 @@ def weighted_rms(difference: Tensor, weight: Tensor) -> Tensor:
     return STEPS * (square / count).sqrt()
 
 
-_FORESIGHT = 1.1  # how much larger than the tolerance the predicted error of a grid may be for it to be tried
+_FORESIGHT = 1.1  # largest predicted error of a grid that is tried, relative to the tolerance
 
 
 @lru_cache(maxsize=64)
 def interpolation(probes: int, texels: int) -> Tensor:
-    """Build the matrix [probes, texels] float32 from a tile's texels to evenly spaced probes along one axis: linear
-    between texel centres and constant beyond the outer ones, as the renderers fetch them."""
+    """Build the matrix [probes, texels] float32 from texels to evenly spaced probes along one axis: linear between
+    texel centres and constant beyond, as the renderers fetch them."""
     x = ((torch.arange(probes, dtype=torch.float64) + 0.5) * texels / probes - 0.5).clamp(0, texels - 1)
     low = x.floor().long().clamp(max=max(texels - 2, 0))
     matrix = torch.zeros(probes, texels, dtype=torch.float64)
@@ -109,13 +107,9 @@ def fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
 
 @torch.no_grad()
 def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress) -> Tiles:
-    """Resample every tile to the smallest grid within the tolerance; drop the tile where one colour is within it.
-
-    The error of a grid is (reconstruction - what the tile should hold) times the largest blending weight that a
-    fragment has there, in 8-bit steps: its root mean square over the colour channels and over the part of the support
-    that gets a residual. Grids are tried by their number of texels, starting with none (one constant colour). The first
-    within the tolerance is taken, the tile itself at the latest. `inputs`: the surfels, and what the views see of them;
-    their device does the work."""
+    """Resample every tile to the smallest grid within the tolerance, or to no tile where one colour is within it, by
+    the error of the reconstruction (`weighted_rms`). Grids are tried by their number of texels. The device of `inputs`
+    does the work."""
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
     device, parts, done = opacity.device, [], 0
     shown = TileVisibility(opacity, beta, tiles.extent.to(device), inputs.weight_bound)
@@ -144,9 +138,8 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
 
 
 def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list[tuple[tuple[int, int], Tensor]]:
-    """Find the smallest grid within the tolerance for each tile [n, C, v, u]: pairs of size and rows. The root of the
-    summed squares of the errors of coarsening along u alone and along v alone predicts that of both; only grids whose
-    prediction is near the tolerance or below are tried."""
+    """Find the smallest grid within the tolerance for each tile [n, C, v, u]: pairs of size and rows. The errors of
+    coarsening along u alone and along v alone, summed in squares, predict that of both (`_FORESIGHT`)."""
     count, limit_v, limit_u = len(values), *values.shape[2:]
     limits = (limit_u, limit_v)
     sides_u, sides_v = ([r for r in (r_min << i for i in range(16)) if r < side] + [side] for side in limits)

@@ -1,4 +1,4 @@
-"""Fine-tuning of an atlas against the photographs: texels alone; geometry, opacity and view colours stay fixed."""
+"""Fine-tuning of texels alone against the photographs."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from .early_stopping import FEWEST_VIEWS, EarlyStopping, gain, validation_split
 from .stages import Coded, Reduced, Rounded, encoded_texels
 from .tuning_views import TexelList, TuningViews
 
-TO_START = 0.93  # share of the byte limit for coded texels before the last steps, in which they grow a little
-TO_FILL = 0.99  # share of the byte limit that the last steps aim at, where it is to be used up
+TO_START = 0.93  # share of the byte limit before the steps with coded texels, in which they grow a little
+TO_FILL = 0.99  # share of it that the last steps aim at, where it is to be used up
 
 
 @dataclass(frozen=True)
@@ -35,14 +35,13 @@ class StoredTexels:
 
 
 class Cosines:
-    """Coder of texels for a compact bundle, within the limit of bytes of its coding."""
+    """Coder of texels for a compact bundle, within its limit of bytes."""
 
     def __init__(self, baked: Rounded, weights: Tensor) -> None:
         self._most, self._fill = baked.most_bytes, baked.fill
         self._coder = TexelCoder(baked.sizes, weights, baked.step, baked.alpha_codes)
 
     def first(self, texels: Tensor) -> StoredTexels:
-        """Code the initial texels [T, 3]."""
         if self._most is None:
             return self._coded(texels, self._coder.code(texels))
         if self._fill:
@@ -56,7 +55,7 @@ class Cosines:
         return self._coded(texels, codes)
 
     def last(self, best: StoredTexels) -> StoredTexels:
-        """Return the best codes, coded again if they exceed the limit."""
+        """Return the best texels, coded again if they exceed the limit."""
         if self._most is None or best.stored.nbytes() <= self._most:
             return best
         return self._coded(best.listed, self._coder.fit(best.texels, self._most, rounds=1))
@@ -66,20 +65,18 @@ class Cosines:
 
 
 class Pages:
-    """Encoder of an atlas in the format of the bake's options; the range of values is that of the initial texels."""
+    """Encoder of an atlas, with the range of values of the initial texels."""
 
     def __init__(self, baked: Reduced) -> None:
         self._baked, self._range = baked, None
 
     def first(self, texels: Tensor) -> StoredTexels:
-        """Encode the initial texels, see `Cosines.first`."""
         self._range = None
         coded = self.again(texels)
         self._range = coded.stored.range
         return coded
 
     def again(self, texels: Tensor) -> StoredTexels:
-        """Encode later texels, see `Cosines.again`."""
         baked, packing = self._baked, self._baked.packing
         atlas = encoded_texels(baked.with_alpha(texels), packing, baked.options, value_range=self._range)
         constants = texels[first_texels(baked.sizes)]
@@ -95,30 +92,27 @@ class TuneOptions(TexelSteps):
     """Options of the fine-tuning."""
 
     rate: Positive = TexelSteps.rate
-    steps: Count = 400  # Steps before the texels are coded; each renders one training view.
-    ssim_weight: Share = 0.2  # Share of 1 - SSIM in the loss; the rest is L1.
+    steps: Count = 400  # Steps before the texels are coded, of a training view each.
+    ssim_weight: Share = 0.2
     val_every: Count = 8
-    """Spacing of the validation views; the texels that show these best are kept. 0: none, and the last texels are kept,
-    as for texels that have learned from all views."""
+    """Spacing of the validation views, which choose the texels to keep. 0: none; the last texels are kept."""
     checks: PositiveCount = 16  # Evaluations of the validation views over the run.
     patience: PositiveCount = 6  # Evaluations without a gain after which the run ends.
     cache_bytes: NonNegativeInt = 1_000_000_000
-    """Memory for the fragments of the views, first of the validation views, which are drawn most often; what does not
-    fit is traced again whenever it is needed."""
+    """Memory for traced views, first of validation, which are drawn most often; others are traced at every use."""
     seed: int = 0  # Seed of the order of the views.
-    coded_steps: Count = 120
-    """Further steps, which draw the texels as stored: blocks of BC7, or the codes of a compact bundle."""
+    coded_steps: Count = 120  # Further steps, which draw the texels as stored.
     coded_every: PositiveCount = 10  # Steps between codings of the texels.
-    coded_rate: float = 0.02  # Rate of these further steps at the start.
+    coded_rate: float = 0.02  # First rate of these steps.
 
     @classmethod
     def of_learned(cls, steps: int, cache_bytes: int = cache_bytes) -> TuneOptions:
-        """Make options for trained texels: all views train, and all steps draw the texels as stored, at twice the rate,
-        because half of it would need twice the steps."""
+        """Make options for trained texels: all views train, and all steps draw the texels as stored, at twice the rate
+        for half the steps."""
         return cls(steps=0, coded_steps=steps, coded_rate=2 * cls.rate, val_every=0, cache_bytes=cache_bytes)
 
     def check(self) -> None:
-        """Check the values; raise ValueError for one out of range."""
+        """Raise ValueError for an option out of range."""
         check_ranges(self)
         if self.val_every == 1:
             raise ValueError("val_every must not be 1: no view would be left to learn from")
@@ -132,24 +126,20 @@ def tune_atlas(
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
 ) -> Coded:
-    """Fine-tune the texels of a bake against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
+    """Fine-tune the texels of a bake against its training photographs (`losses.photometric`).
 
-    A step moves texel t by t <- t - rate g / (m + prior). Here g is the gradient of one view's loss, as a sum over
-    pixels. m is the sum over all views and fragments of weight times bilinear weight: the number of pixels that show
-    the texel. This is the step of simultaneous algebraic reconstruction (SART), with the loss's gradient for the
-    residual. It needs no second moments, and a texel that is hardly seen hardly moves. The texels that show the
-    validation views best are kept, or the baked ones if none are better.
+    A step moves texel t by t <- t - rate g / (m + prior), with the gradient g of one view's loss, summed over pixels,
+    and the texel's coverage m over all views. This is the step of simultaneous algebraic reconstruction (SART), with
+    the loss's gradient for the residual: a texel that is hardly seen hardly moves.
 
     Args:
-        baked: with tiles, which keep their sizes; constants of surfels without a tile are tuned, too. The last steps
-            see what its coding makes of the texels.
-        views: training views, with the corrections that training found, on any device; every `val_every`-th is for
-            validation.
-        background: [3] colour behind the scene.
-        eval_views: held-out views on which the gain of the stored texels is measured; they decide nothing.
+        baked: with tiles; constants of surfels without one are tuned, too.
+        views: training views, with the corrections of training, on any device.
+        background: [3].
+        eval_views: held-out views on which the gain is measured.
 
-    Returns the bake with coded texels and `statistics.finetune`; the texels stay as they are if there are fewer than
-    `FEWEST_VIEWS` views (without validation, none)."""
+    Returns the bake with coded texels, which stay as they are with fewer than `FEWEST_VIEWS` views (without validation,
+    none), and `statistics.finetune`."""
     options = options or TuneOptions()
     options.check()
     if len(views) < (FEWEST_VIEWS if options.val_every else 1):
@@ -159,7 +149,7 @@ def tune_atlas(
     budget = MemoryBudget(options.cache_bytes)
     held_back, trained = validation_split(views, options.val_every)
     validation, tuned = (TuningViews(texels, part, background, budget) for part in (held_back, trained))
-    before = validation.psnr(texels.values, progress)  # before others: the cache is filled in this order
+    before = validation.psnr(texels.values, progress)  # first, to fill the cache
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)
     if isinstance(baked, Rounded):
         covered, coder = baked.coverage.to(baked.device), Cosines(baked, baked.coverage[:, 1])
@@ -195,8 +185,7 @@ def _coded(
     options: TuneOptions,
     progress: Progress,
 ) -> StoredTexels:
-    """Optimise texels [T, 3] through their coding: the image is that of the stored texels, and its gradient moves the
-    uncoded."""
+    """Optimise texels [T, 3] through their coding: the gradient of the image of the stored texels moves the uncoded."""
     coded = coding.first(texels.cpu())
     texels = coded.texels.to(texels.device, copy=True)
     psnr = validation.psnr(texels, progress)

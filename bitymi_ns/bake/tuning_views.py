@@ -1,4 +1,4 @@
-"""Fine-tuning of a bake's texels on the photographs: the list of texels, and views traced once and cached."""
+"""Texels and traced views for the fine-tuning of a bake."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,8 +28,8 @@ from .stages import Stage
 
 
 class TexelList:
-    """The texels of a bake on its device, tile after tile: [T, 3] residual colours as baked (`values`), and alphas,
-    which are not tuned (None = opaque). A surfel without a tile has one texel, its constant residual."""
+    """Texels of a bake on its device (`Stage.texels`): residual colours [T, 3], `values`, and alphas, which are not
+    tuned (None = opaque)."""
 
     def __init__(self, baked: Stage) -> None:
         """Raises ValueError: no surfel has a tile."""
@@ -46,8 +46,8 @@ class TexelList:
         return project(*geometry, camera=camera.to(self.device), near=self.scene.near, alpha=self.alpha)
 
     def coverage(self, views: Sequence[View], progress: Progress = no_progress) -> Tensor:
-        """Measure every texel's coverage in unmasked pixels: [T, 2], the sums over views and fragments of the blending
-        weight, and of its square, times the bilinear weight."""
+        """Measure the coverage of every texel in unmasked pixels, [T, 2]: the sums over views and fragments of blending
+        weight, and of its square, times bilinear weight."""
         covered = self.values.new_zeros(len(self.values), 2)
         for done, view in enumerate(views, start=1):
             projection = self.projection(view.camera)
@@ -56,21 +56,20 @@ class TexelList:
         return covered
 
 
-LEAST_KEPT = 1 / 8
-"""Least share of the views that must fit the budget for any to be kept: fewer save too little time."""
+LEAST_KEPT = 1 / 8  # share of the views that must fit the budget for any to be kept
 
 
 @dataclass
 class TuningView:
-    """A photograph and its traced view: the fragments with texels, and the render of everything else."""
+    """A photograph and its traced view."""
 
-    projection: Projection  # of the surfels into the first view: blending reads of it only the unused beta channel
-    lists: list[Fragments]  # the fragments that show a texel, in bands from top to bottom
-    base: Tensor  # [N, 3] f_view of every surfel
-    rest: Tensor  # [H, W, 3] the picture without these fragments: the faint ones, and the background
+    projection: Projection  # into the first view: blending reads of it only the unused beta channel
+    lists: list[Fragments]  # those that show a texel, in bands from top to bottom
+    base: Tensor  # [N, 3] f_view
+    rest: Tensor  # [H, W, 3] the picture without these fragments
     target: Tensor  # [H, W, 3] the photograph over the background
-    mask: Tensor | None  # [H, W, 1] bool, True where the pixel counts; None = everywhere
-    correction: Tensor | None = None  # of the photograph's exposure, as in `View`; None = there is none
+    mask: Tensor | None  # [H, W, 1] bool, as in `View`
+    correction: Tensor | None = None  # as in `View`
     alpha: Tensor | None = None  # [H, W, 1] coverage; None without a correction
 
     @property
@@ -80,14 +79,13 @@ class TuningView:
 
 
 class TuningViews(Sequence[TuningView]):
-    """Views of a bake, traced when they are needed and kept while there is budget for them."""
+    """Views of a bake, traced at first use and kept while there is budget for them."""
 
     def __init__(self, texels: TexelList, views: Sequence[View], background: Tensor, budget: MemoryBudget) -> None:
-        """Trace views before a background, [3] colour behind the scene."""
         self._texels, self._views, self._budget = texels, views, budget
         self._background = background.to(texels.device)
         self._kept: dict[int, TuningView] = {}
-        self._keeps: bool | None = None  # whether any; not known before the first one
+        self._keeps: bool | None = None  # whether any; None before the first
         self._projection: Projection | None = None  # of the first view
 
     def __len__(self) -> int:
@@ -133,8 +131,7 @@ class TuningViews(Sequence[TuningView]):
         )
 
     def picture(self, view: TuningView, texels: Tensor, descent: TexelDescent | None = None) -> Tensor:
-        """Render a view of this sequence with texels [T, 3], not quantised, and its photograph's correction: [H, W,
-        3]."""
+        """Render a view of this sequence with texels [T, 3] and its photograph's correction: [H, W, 3]."""
         drawn = (view.projection, view.base, texels, self._texels.tiles)
         rgb = torch.cat([blended_image(part, *drawn, descent=descent)[:, :3] for part in view.lists])
         rgb = rgb.view_as(view.rest) + view.rest
@@ -143,9 +140,8 @@ class TuningViews(Sequence[TuningView]):
     def step(
         self, index: int, texels: Tensor, step_size: Tensor, rate: float, ssim_weight: float, read: Tensor | None = None
     ) -> None:
-        """Take a gradient step on `texels` [T, 3] in place with a view's loss, summed over pixels and channels instead
-        of averaged: texel t moves by -rate step_size[t] times its gradient. `read`: [T, 3] texels that the picture
-        shows; None = those that are moved."""
+        """Move texels [T, 3] in place by -rate step_size[t] times the gradient of a view's loss, summed over pixels and
+        channels. `read`: [T, 3] texels that the picture shows; None = those that are moved."""
         view = self[index]
         if read is None:
             read = texels if len(view.lists) == 1 else texels.clone()  # a band must not read what another has moved

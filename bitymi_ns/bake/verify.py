@@ -1,4 +1,4 @@
-"""Checks of a bundle against the trained scene that it was baked from."""
+"""Checks of a bundle against its trained scene."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,7 +14,7 @@ from bitymi_ns.scene.tile_sizes import kernel_parameters
 from bitymi_ns.scene.visibility import visibility
 from .view_colors import centers_of, view_color_errors
 
-_SLACK = 1.02  # largest ratio to the stated error: sums in another order, rotations that were written with length 1
+_SLACK = 1.02  # of the stated error: sums in another order, rotations written with length 1
 
 
 def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Sequence[Camera]) -> Check:
@@ -51,6 +51,6 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
 
 
 def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:
-    """Select the numbers per surfel that a bundle holds bit for bit."""
+    """Select the numbers of a surfel that a bundle holds bit for bit."""
     parts = [surfels[name][..., None].flatten(1) for name in GEOMETRY if name != "quats"]
     return [row.tobytes() for row in torch.cat(parts, dim=1).numpy()]

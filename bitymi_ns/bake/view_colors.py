@@ -1,4 +1,4 @@
-"""View colours of fewer terms: within the tolerance, and for compact bundles by rate-distortion."""
+"""Reduced view colours: within the tolerance, and for compact bundles by rate-distortion."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,23 +22,21 @@ from .directions import Directions, view_directions
 from .inputs import BakeInput
 
 BITS_PER_NUMBER = 5.5  # approximate bits per number of a term in a compact bundle
-LEAST_WEIGHT = 1e-12  # added to the weight of every direction, so that surfels which no view shows have a mean
-VIEW_SHARE = 0.5  # weight of the training views; the rest are directions between and around them
+LEAST_WEIGHT = 1e-12  # added to the weight of every direction: surfels which no view shows have a mean, too
+VIEW_SHARE = 0.5  # weight of the training views; the rest is of directions between and around them
 BLIND = 4  # number of nearest views without the surfel whose directions count as well
-BLIND_SHARE = 0.1
-"""Weight of these directions, as a share of what a view from there would show: a new view may show the surfel."""
+BLIND_SHARE = 0.1  # weight of these, as a share of what a view from there would show
 
 
 @dataclass(frozen=True)
 class ColorChoices:
-    """View colours of N surfels, from the most terms that a tolerance needs down to one colour."""
+    """View colours of N surfels, from the terms that a tolerance needs down to one colour."""
 
-    # [N, most + 1] squared error in the views, summed over pixels and channels, of every number of terms; infinite
-    # where that number is no choice
+    # [N, most + 1] squared error in the views by number of terms, summed over pixels and channels; infinite: no choice
     error: Tensor
     largest: Tensor  # [N] largest error with the most terms, over all directions, times blending weight, 8-bit steps
     width: int  # numbers of a term
-    # rows [n] int64 of surfels, and their base colours [n, 3] and terms [n, number, width] for a number of terms
+    # rows [n] int64 of surfels, their base colours [n, 3] and terms [n, number, width]
     choices: Sequence[tuple[Tensor, Tensor, Tensor]]
 
     def at(self, lmbda: float | None = None) -> dict[str, Tensor]:
@@ -59,7 +57,7 @@ class ColorChoices:
 
 
 def choice_bytes(kind: str, surfels: int, views: int, most: int) -> int:
-    """Estimate the memory of `color_choices`, bytes. `most`: reduced terms of a surfel."""
+    """Estimate the memory of `color_choices`, bytes. `most`: terms of a surfel."""
     entry = VIEW_COLORS[kind]
     numbers = range(most + 1) if entry.sites is not None else sorted({0, most})
     of_surfel = 4 * (most + 1) + sum(8 + 4 * (3 + entry.reduced_width * number) for number in numbers)
@@ -91,26 +89,24 @@ def color_choices(
     near: float = 0.0,
     progress: Progress = no_progress,
 ) -> ColorChoices:
-    """Fit view colours of fewer terms, from one colour up to the fewest terms within a tolerance; returned on the CPU.
+    """Fit view colours from one colour up to the fewest terms within a tolerance; returned on the CPU.
 
-    The tolerance bounds the largest error over all directions of `view_directions` and the channels, of max(f_view +
-    0.5, 0), times the largest blending weight that the surfel can have. One colour is tried first, the middle between
-    the extremes; then 2, 3, ... sites: those that are hardest to do without, fitted together by least squares. A surfel
-    for which none is good enough keeps all sites. Surfels of a kind without sites (`ViewColor.sites`) keep one colour,
-    or all terms.
+    The tolerance bounds the error of max(f_view + 0.5, 0), the largest over directions (`view_directions`) and
+    channels, times the largest blending weight. One colour is tried first, the middle between the extremes; then 2, 3,
+    ... sites: those that are hardest to do without, fitted together by least squares. Kinds without sites
+    (`ViewColor.sites`) have one colour, or all terms.
 
-    Colours of fewer terms are choices, too, each with its squared error in the pictures, weighted by what the views
-    show of the surfel (`squares`): half of the weight lies on the directions of the training views, half on directions
-    between and around them. Directions from the nearest views that do not show the surfel add to it, by what those
-    would show, as a new view from near there may show it. Sites are fitted to this error.
+    Every choice has its squared error in the pictures, weighted by what the views show of the surfel (`squares`): half
+    of the weight lies on their directions, half on directions between and around them. Directions of the nearest other
+    views are added (`_unseen`). Sites are fitted to this error.
 
     Args:
-        surfels: per-surfel parameters, N rows; their device does the work.
-        squares: [V, N] what the training views show of each surfel (`Visibility.squares`); V may be 0.
+        surfels: parameters, N rows; their device does the work.
+        squares: [V, N], `Visibility.squares`; V may be 0.
         centers: [V, 3] float64 camera centres.
         opacity: [N] largest blending weight.
         tolerance: 8-bit steps.
-        near: near plane; views count as at least that far from a surfel."""
+        near: near plane, the least distance of a view."""
     means, entry = surfels["means"], VIEW_COLORS[kind]
     most = entry.terms(surfels) - entry.base_terms
     error = means.new_full((len(means), most + 1), torch.inf)
@@ -125,7 +121,7 @@ def color_choices(
         target = shown_at(kind, dict(zip(entry.names, own, strict=True)), chunk.unit)
 
         def rest_of(rows: Tensor, base: Tensor, terms: Tensor, shown: Tensor) -> Tensor:
-            """Record a choice for rows of the chunk; return the rows whose error exceeds the tolerance."""
+            """Record a choice; return the rows whose error exceeds the tolerance."""
             away = shown - target[rows]  # noqa: B023 - called in this round alone
             square = (away.square().sum(2) * weight[rows]).sum(1)  # noqa: B023
             bad = beyond("view_base", kind, base).any(1) | beyond("view_terms", kind, terms).flatten(1).any(1)
@@ -162,8 +158,8 @@ def color_choices(
 
 
 def _weights(chunk: Directions, weights: Tensor) -> Tensor:
-    """Compute the weights [n, D] of the directions from the views' weights [V, n]: `VIEW_SHARE` of a view's
-    weight for its own direction, the rest spread evenly over the directions of no view."""
+    """Compute the weights [n, D] of directions from those of views [V, n]: `VIEW_SHARE` for their own, the rest spread
+    evenly over the directions of no view."""
     of_views = weights.T.gather(1, chunk.view) * chunk.valid[:, : chunk.views]
     rest = chunk.valid.shape[1] - chunk.views
     between = (1 - VIEW_SHARE) * of_views.sum(1, keepdim=True) / max(1, rest)
@@ -171,9 +167,9 @@ def _weights(chunk: Directions, weights: Tensor) -> Tensor:
 
 
 def _unseen(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
-    """Find the directions [n, BLIND, 3] from the nearest views that do not show a surfel, and their weights [n, BLIND]:
-    a share of the mean weight of the views that show it, scaled by the inverse square of the distance; 0 where there is
-    no such view. `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
+    """Find the directions [n, BLIND, 3] from the nearest views that do not show a surfel, as a new view near there may,
+    and their weights [n, BLIND]: a share of the mean weight of the views that show it, scaled by the inverse square of
+    the distance; 0 without such a view. `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
     offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
     square, shows = offset.square().sum(2).clamp(min=near * near), weights.T > 0
     from_unit = (weights.T * square).sum(1) / shows.sum(1).clamp(min=1)
@@ -183,7 +179,7 @@ def _unseen(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tup
 
 
 def _one_color(target: Tensor, valid: Tensor, weight: Tensor, allowed: Tensor) -> Tensor:
-    """Choose the middle [n, 3] of the extremes of colours [n, D, 3] if within `allowed` [n] 8-bit steps, else their
+    """Choose the middle [n, 3] of the extremes of colours [n, D, 3] if within `allowed` [n], 8-bit steps, else the
     mean."""
     low = target.masked_fill(~valid[..., None], torch.inf).amin(1)
     high = target.masked_fill(~valid[..., None], -torch.inf).amax(1)
@@ -202,9 +198,9 @@ def view_color_errors(
     centers: Tensor,
     opacity: Tensor,
 ) -> Tensor:
-    """Measure the largest error of every surfel's view colour over the directions of `view_directions`, times its
-    largest blending weight, in 8-bit steps: [N]. `full`, `reduced`: parameters before and after. `seen`: [V, N] bool,
-    training views that see each surfel; V may be 0. `centers`, `opacity`: as in `color_choices`."""
+    """Measure the largest error of every view colour over the directions, times the largest blending weight, [N] 8-bit
+    steps. `full`, `reduced`: parameters before and after. `seen`: [V, N] bool, training views that see each surfel; V
+    may be 0. `centers`, `opacity`: as in `color_choices`."""
     error = means.new_zeros(len(means))
     for chunk in view_directions(means, seen, centers):
         exact = shown_at(kind, {name: full[name][chunk.rows] for name in VIEW_COLORS[kind].names}, chunk.unit)
@@ -217,8 +213,7 @@ def view_color_errors(
 def reduce_view_colors(
     inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress
 ) -> tuple[dict[str, Tensor], ColorChoices | None, ViewColorError | None]:
-    """Reduce the view colours within the tolerance; 0 keeps all terms. Returns surfels, the choices of fewer terms and
-    the error."""
+    """Reduce the view colours within the tolerance; 0 keeps all terms. Returns surfels, choices and error."""
     surfels, tolerance = dict(inputs.surfels), options.tolerance
     if tolerance == 0:
         return surfels, None, None
@@ -244,14 +239,14 @@ def reduce_view_colors(
 
 
 FIT_STEPS = 6
-FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all of them
+FIT_VIEWS = 16  # views of a surfel in the fit; the error is measured in all
 OUTSIDE, OUTSIDE_WEIGHT = 12, 0.05
-"""Directions over the whole sphere, and their weight, in the fit: where no view is, the colour follows the trained one
-loosely instead of diverging."""
+"""Directions over the sphere, and their weight, in the fit: away from views, the colour follows the trained one
+loosely."""
 
 
 def site_colors(vectors: Tensor, rgb: Tensor, directions: Tensor) -> Tensor:
-    """Compute sum_k softmax_k(v_k . d) rgb_k, [n, D, 3], from sites v and rgb [n, K, 3] and directions d [n, D, 3]."""
+    """Compute sum_k softmax_k(v_k . d) rgb_k, [n, D, 3], from v and rgb [n, K, 3] and directions d [n, D, 3]."""
     weights = torch.softmax(vectors @ directions.transpose(1, 2), dim=1)  # far slower along a short last axis
     return weights.transpose(1, 2) @ rgb
 
@@ -260,9 +255,8 @@ def fewer_sites(
     chunk: Directions, weight: Tensor, vectors: Tensor, rgb: Tensor
 ) -> Callable[[int, Tensor], tuple[Tensor, Tensor]]:
     """Rank the sites by how much they are needed, and return a fit of the first ones to the colour of all, by
-    Levenberg-Marquardt: a function of a number of sites below K, and of rows, to base [m, 3] and terms [m, number - 1,
-    6]. `weight`: [n, D'] of the directions that `Directions.subset` selects. `vectors`, `rgb`: [n, K, 3] of all
-    sites."""
+    Levenberg-Marquardt, from a number of sites below K, and rows, to base [m, 3] and terms [m, number - 1, 6].
+    `weight`: [n, D'] of `Directions.subset`. `vectors`, `rgb`: [n, K, 3]."""
     outside = fibonacci_sphere(OUTSIDE).to(vectors).expand(len(vectors), -1, -1)
     unit = torch.cat([chunk.subset(chunk.unit, FIT_VIEWS), outside], dim=1)
     weight = F.pad(weight, (0, OUTSIDE), value=OUTSIDE_WEIGHT)

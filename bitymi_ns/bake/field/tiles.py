@@ -1,4 +1,4 @@
-"""Tiles of a residual field (paper, section Texture Baking): a grid for every surfel, with the field at its texels."""
+"""Tiles of a residual field (paper, section Texture Baking)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -29,11 +29,8 @@ PAPER_EXTENT = 4.0  # e of the paper's rule
 
 
 class Field(Protocol):
-    """The part of the residual field that the bake uses.
-
-    A field that also has `geometry.mid`, the centre of its contraction, gets tiles that follow the direction in which
-    its voxels are stretched; without it the smaller voxel edge holds for both axes.
-    """
+    """What the bake uses of a residual field. Tiles follow the direction in which voxels are stretched if it also has
+    `geometry.mid`, the centre of its contraction; else the smaller edge holds for both axes."""
 
     def __call__(self, x: Tensor) -> Tensor:
         """Map world positions [M, 3] to residual colours [M, 3]."""
@@ -52,14 +49,13 @@ def field_tiles(
     pixels_per_texel: float | None = None,
     progress: Progress = no_progress,
 ) -> Trained:
-    """Give the surfels of a bake without tiles, tiles with the values of a field at the texel centres; leave out
-    surfels as `prune.drop_unseen` does. The tiles are not reduced yet (`prune.prune_and_resample`).
+    """Drop surfels of a bake without tiles (`prune.drop_unseen`), and make tiles with the values of a field at the
+    texel centres.
 
-    With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it nothing is seen: the
-    field is read at the nearest point of the disc, so values stay smooth and within the range of what is seen.
-    `cameras`: training views, for the cap on tile sizes and for what they see. `pixels_per_texel`: a tile gets at most
-    one texel per this number of pixels that its surfel fills in the view that shows most of it; None = as many as field
-    and views resolve. Raises ValueError: no surfel is left, or the atlas would be too large."""
+    With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it the field is read at
+    the nearest point of the disc: values stay smooth and in the range of what is seen. `cameras`: of the training
+    views. `pixels_per_texel`: least number of pixels of the surfel per texel, in the view that shows most of it; None =
+    as many texels as field and views resolve. Raises ValueError: no surfel is left, or the atlas would be too large."""
     options = baked.options
     means, scales = (baked.scene.surfels[name].to(baked.device) for name in ("means", "log_scales"))
     finest = torch.stack([field.voxel_size(part).amin() for part in means.split(options.chunk)]).amin()
@@ -94,8 +90,8 @@ def field_tiles(
 def grids(
     inputs: BakeInput, field: Field, options: BakeOptions, pixels_per_texel: float | None
 ) -> tuple[Tensor, Tensor, dict[str, int]]:
-    """Choose the finest useful grids: sides [N, 2] int32, (0, 0) = none, and half sides [N] in scale units; also count
-    the texels by each rule of `KeptTexels`."""
+    """Choose the finest useful grids: sides [N, 2] int32, (0, 0) = none, and half sides [N], scale units; and texels by
+    rule of `KeptTexels`."""
     surfels = inputs.surfels
     means, scales, axes = surfels["means"], surfels["log_scales"].exp(), tangents(surfels["quats"])
     opacity, beta = kernel_parameters(surfels, inputs.transmittance)

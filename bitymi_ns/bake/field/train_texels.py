@@ -1,4 +1,4 @@
-"""Polish of a bake: a training run of its texels and surfels together, without the network and densification."""
+"""Polish of a bake: a training run of texels and surfels, without network and densification."""
 
 import math
 import time
@@ -25,19 +25,19 @@ from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
 
 MEANS = (1.6e-4, 1.6e-6)
-"""First and last learning rates of positions, in scene extents: polishing was measured with these, not in pixels."""
+"""First and last learning rates of positions, in scene extents."""
 
 
 @dataclass
 class PolishOptions(TuneOptions):
-    """Options of the polish: `rate` and `prior` are of the texels."""
+    """Options of the polish; `rate` and `prior` are of the texels."""
 
     steps: PositiveCount = 300
     share: Positive = 0.4
-    """Rates of the surfels, as a share of those of a training run of as many steps; they fall to 0 as a cosine."""
+    """Rates of the surfels, as a share of those of a training run of as many steps; cosine decay to 0."""
     checks: PositiveCount = 10
     pixels_per_texel: Positive = 0.25
-    """A tile starts with at most one texel per this number of pixels in the view that shows most of its surfel."""
+    """Least number of pixels per texel, in the view that shows most of the surfel."""
 
 
 def _polish_run(
@@ -48,7 +48,7 @@ def _polish_run(
     train: TrainConfig,
     progress: Progress,
 ) -> Trainer:
-    """Set up a training run that consists of the texel stage alone and keeps the number of surfels."""
+    """Set up a training run of the texel stage alone that keeps the number of surfels."""
     texels = TexelList(baked)
     drawn, tiles = texels.scene, texels.tiles
     step_size = 1.0 / (texels.coverage(views, progress)[:, 0] + options.prior)
@@ -93,21 +93,20 @@ def polish_scene(
     progress: Progress = no_progress,
     eval_views: Sequence[View] = (),
 ) -> Trained:
-    """Optimise texels and surfels of a bake together against its training photographs, 0.8 L1 + 0.2 (1 - SSIM).
+    """Optimise texels and surfels of a bake together against its training photographs (`losses.photometric`).
 
-    Surfels move by Adam, texels as in `tune_atlas`, with the coverage of the bake. Surfels keep their tiles with their
-    extents and sizes: a fragment beyond its tile reads the edge, while it learns and when it is drawn. Nothing is
-    densified. The state kept is the one that shows the validation views best, the bake itself where none is better. A
+    Surfels move by Adam, texels as in `tune_atlas`, with the coverage of the bake. Tiles keep their sizes: a fragment
+    beyond its tile reads the edge. The state that shows the validation views best is kept, the bake itself included. A
     step that is not finite takes the scene back to that state, with smaller rates.
 
     Args:
-        baked: with texels and all of its view colours, made with `pixels_per_texel`.
-        views: training views, with the corrections that training found; every `val_every`-th is for validation.
-        background: [3] colour behind the scene, except in training where `train.background` changes it by step.
-        eval_views: views of which the gain is stated; they decide nothing.
+        baked: with texels and whole view colours.
+        views: training views, with the corrections of training.
+        background: [3], except in steps where `train.background` changes it.
+        eval_views: views of which the gain is stated.
 
-    Returns a new bake with `statistics.polish`; with fewer than 4 views, `baked` with 0 steps in it. Raises ValueError:
-    there is no atlas, the view colours are reduced, or an option is out of range."""
+    Returns the bake with `statistics.polish`; unchanged with fewer than `FEWEST_VIEWS` views. Raises ValueError: there
+    is no atlas, view colours are reduced, or an option is out of range."""
     options = options or PolishOptions()
     options.check()
     if len(views) < FEWEST_VIEWS:
@@ -135,7 +134,7 @@ def _optimise(
     guard: GuardConfig,
     progress: Progress,
 ) -> EarlyStopping[dict[str, Tensor]]:
-    """Train; return the state that shows the validation views best, and the evaluations."""
+    """Train; return the best state and the evaluations."""
 
     def state() -> dict[str, Tensor]:
         return {name: value.detach().clone() for name, value in run.scene.state_dict().items()}

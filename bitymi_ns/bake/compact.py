@@ -182,8 +182,8 @@ def compacted(
     elif options.psnr is not None:
         if coder.psnr < options.psnr:
             raise ValueError(
-                f"the bake shows the training photographs at {coder.psnr:.2f} dB, not at {options.psnr:g} dB: ask for "
-                "less, or train for longer"
+                f"the bake shows the training photographs at {coder.psnr:.2f} dB, {options.psnr:g} dB cannot be "
+                "reached: ask for less, or train for longer"
             )
         lost = max(1e-6, coder.psnr - options.psnr)
         chosen, _ = _search(coder, lambda point: (coder.psnr - point.psnr) / lost, progress)
@@ -207,15 +207,15 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | 
         tried = [(0.0, 0.0)]  # logarithms of lambda and bytes over the chosen ones
         step = math.log(factor)
         for _ in range(_TRIES):
-            other = coder.at(math.exp(step) * chosen.lmbda, held_out=True)
-            tried.append((step, math.log(other.bytes / chosen.bytes)))
+            point = coder.at(math.exp(step) * chosen.lmbda, held_out=True)
+            tried.append((step, math.log(point.bytes / chosen.bytes)))
             if abs(tried[-1][1] - math.log(wanted)) < math.log(_CLOSE):
                 break
-            (a, low), (b, high) = sorted(tried, key=lambda point: abs(point[1] - math.log(wanted)))[:2]
+            (a, low), (b, high) = sorted(tried, key=lambda pair: abs(pair[1] - math.log(wanted)))[:2]
             if low == high:
                 break
             step = max(-12.0, min(12.0, a + (math.log(wanted) - low) * (b - a) / (high - low)))
-        alternatives.append((other.bytes / chosen.bytes, other.psnr - base))
+        alternatives.append((point.bytes / chosen.bytes, point.psnr - base))
     return alternatives
 
 

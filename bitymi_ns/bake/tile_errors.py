@@ -44,8 +44,8 @@ def listed_errors(
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
     """Compute the pixels per scale unit [N, 2] along u and v in the view that shows a surfel largest; 0 if its square
     of half side `extent`, scale units, meets no image. `near`: camera z."""
-    at = (surfels["means"], tangents(surfels["quats"]), surfels["log_scales"].exp())
-    return max_projected_extent(*at, cameras, extent, near) / (2.0 * extent)
+    axes, scales = tangents(surfels["quats"]), surfels["log_scales"].exp()
+    return max_projected_extent(surfels["means"], axes, scales, cameras, extent, near) / (2.0 * extent)
 
 
 def cells_per_pixel(shown: TileVisibility, rows: Tensor, size: tuple[int, int]) -> Tensor:

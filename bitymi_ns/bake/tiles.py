@@ -122,11 +122,11 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
         flat = weighted_rms(values - mean[:, :, None, None], weight) <= options.tolerance
         constant[rows.cpu()] = mean.cpu()
         textured = torch.nonzero(~flat).squeeze(1)
-        for smaller, at in _grids(values[textured], weight[textured], options.tolerance, options.r_min):
-            at = textured[at]
-            texels = values[at] if smaller == size else fitted(values[at], smaller)
-            sizes[rows[at].cpu()] = torch.tensor(smaller, dtype=torch.int32)
-            parts.append((rows[at].cpu(), texels.cpu()))
+        for smaller, chosen in _grids(values[textured], weight[textured], options.tolerance, options.r_min):
+            chosen = textured[chosen]
+            texels = values[chosen] if smaller == size else fitted(values[chosen], smaller)
+            sizes[rows[chosen].cpu()] = torch.tensor(smaller, dtype=torch.int32)
+            parts.append((rows[chosen].cpu(), texels.cpu()))
         done += len(rows)
         progress("choosing the tiles", done, len(sizes))
     first = first_texels(sizes)
@@ -156,12 +156,12 @@ def _grids(values: Tensor, weight: Tensor, tolerance: float, r_min: int) -> list
     open_ = torch.ones(count, dtype=torch.bool, device=values.device)
     for size in sorted(((u, v) for u in sides_u for v in sides_v), key=lambda s: (s[0] * s[1], abs(s[0] - s[1]))):
         promising = open_ & (along_u[size[0]] + along_v[size[1]] <= (_FORESIGHT * tolerance) ** 2)
-        at = torch.nonzero(promising).squeeze(1)
-        if size != limits and len(at):
+        rows = torch.nonzero(promising).squeeze(1)
+        if size != limits and len(rows):
             finer = (interpolation(limit, side).to(values) for limit, side in zip(limits, size, strict=True))
-            rebuilt = along_axes(fitted(values[at], size), *finer)
-            at = at[weighted_rms(rebuilt - values[at], weight[at]) <= tolerance]
-        if len(at):
-            open_[at] = False
-            chosen.append((size, at))
+            rebuilt = along_axes(fitted(values[rows], size), *finer)
+            rows = rows[weighted_rms(rebuilt - values[rows], weight[rows]) <= tolerance]
+        if len(rows):
+            open_[rows] = False
+            chosen.append((size, rows))
     return chosen

@@ -43,11 +43,11 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
         views = visibility(trained, cameras, render.near, alpha=texel_alpha(bundle.scene))
         seen, transmittance = views.seen, views.in_front
     opacity, _ = kernel_parameters(trained, transmittance)
-    at = (means, seen, centers_of(cameras, means), opacity)
-    found = float(view_color_errors(bundle.scene.view_color, trained, bundle.scene.surfels, *at).amax())
+    views = (means, seen, centers_of(cameras, means), opacity)
+    largest = float(view_color_errors(bundle.scene.view_color, trained, bundle.scene.surfels, *views).amax())
     bound = stated.error.p100
-    ok = bound is not None and found <= bound * _SLACK + SLACK_STEPS
-    return Check(name, ok, f"largest {found:.3f} (stated {steps_text(bound)}, tolerance {stated.tolerance:g}) steps")
+    ok = bound is not None and largest <= bound * _SLACK + SLACK_STEPS
+    return Check(name, ok, f"largest {largest:.3f} (stated {steps_text(bound)}, tolerance {stated.tolerance:g}) steps")
 
 
 def _keys(surfels: Mapping[str, Tensor]) -> list[bytes]:

@@ -223,7 +223,7 @@ def reduce_view_colors(
     views = (squares, centers_of(inputs.cameras, means), opacity)
     choices = color_choices(surfels, kind, *views, tolerance, inputs.near, progress)
     reduced, entry = choices.at(), VIEW_COLORS[kind]
-    before = sum(each[0].numel() for each in entry.of(surfels)) if len(means) else 0
+    before = sum(parameter[0].numel() for parameter in entry.of(surfels)) if len(means) else 0
     sites = 1 + entry.terms(surfels) - entry.base_terms  # the base of a reduced colour, and its terms
     stated = ViewColorError(
         kind=kind,

@@ -68,7 +68,7 @@ class LearningTexels:
         fitting = max(0, int(room_to_grow(device, self.processes) / texel_bytes))
         made = None
         if self.processes.first:
-            made = _blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come, fitting)
+            made = blank_texels(self.scene, sampled, len(views), self.options, self.views_to_come, fitting)
         stated = None if made is None else {**made[0].state_dict(), "bound": made[1]}
         stated = self.processes.from_first(stated, device)
         self.most_by_memory = len(stated["texels"]) if stated.pop("bound") else 0
@@ -138,27 +138,20 @@ class LearningTexels:
                     values.clamp_(0.0, ALPHA_LIMIT)
 
 
-def blank_texels(
-    scene: Scene, views: Sequence[View], count: int, options: TexelConfig, to_come: float = math.inf
-) -> TexelField:
-    """Create a tile for every surfel, with residuals of 0, and alphas of 1 if alphas are trained.
-
-    A surfel without fragments that may have a residual gets one texel. `views`: sample of the `count` training views,
-    at full size; cameras and masks are used. `to_come`: number of renders in the texel stage."""
-    return _blank_texels(scene, views, count, options, to_come)[0]
-
-
 @torch.no_grad()
-def _blank_texels(
+def blank_texels(
     scene: Scene,
     views: Sequence[View],
     count: int,
     options: TexelConfig,
-    to_come: float,
+    to_come: float = math.inf,
     fitting: float = math.inf,
 ) -> tuple[TexelField, bool]:
-    """As `blank_texels`, with at most `fitting` texels as far as the smallest tiles allow; True: they are fewer than
-    wanted."""
+    """Create a tile for every surfel, with residuals of 0, and alphas of 1 if alphas are trained.
+
+    A surfel without fragments that may have a residual gets one texel. `views`: sample of the `count` training views,
+    at full size; cameras and masks are used. `to_come`: number of renders in the texel stage. `fitting`: maximum number
+    of texels, as far as the smallest tiles allow. True: it has reduced them."""
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound

@@ -57,7 +57,7 @@ def state_of(scene: Scene) -> dict[str, Tensor]:
 
 def test_tiles_and_coverage_are_those_of_the_cpu(device: torch.device, both) -> None:
     scene, views = scene_and_views()
-    got, want = both(lambda where: blank_texels(scene.to(where), views, 4, config().texels))
+    got, want = both(lambda where: blank_texels(scene.to(where), views, 4, config().texels)[0])
     assert got.texels.device.type == device.type and len(got.texels) == len(want.texels) > 200
     assert torch.equal(got.size.cpu(), want.size) and want.size.max() > 4
     torch.testing.assert_close(got.extent.cpu(), want.extent, rtol=1e-4, atol=1e-5)

@@ -89,19 +89,19 @@ def test_there_are_no_more_texels_than_a_run_can_use(textured, views, monkeypatc
     scene, cameras = textured(), [view.camera for view in views]
     pixels = sum(camera.width * camera.height for camera in cameras) / len(cameras)
     options = replace(OPTIONS, pixels_per_texel=0.01, rendered_pixels_per_texel=8.0)
-    free = blank_texels(scene, views, len(views), options, to_come=1)  # below any limit
+    free, _ = blank_texels(scene, views, len(views), options, to_come=1)  # below any limit
     smallest = SMALLEST**2 * len(scene)
     assert len(free.texels) > 2 * smallest
     monkeypatch.setattr(texels, "FEW", smallest)
     for share in (0.5, 0.8, 2.0):
         to_come = share * len(free.texels) * options.rendered_pixels_per_texel / pixels
-        bound = blank_texels(scene, views, len(views), options, to_come)
+        bound, _ = blank_texels(scene, views, len(views), options, to_come)
         if share < 1:
             assert 0.5 * share * len(free.texels) < len(bound.texels) <= share * len(free.texels)
             assert (bound.size <= free.size).all()
         else:
             assert torch.equal(bound.size, free.size)
-    assert len(blank_texels(scene, views, len(views), options, to_come=0).texels) <= smallest
+    assert len(blank_texels(scene, views, len(views), options, to_come=0)[0].texels) <= smallest
 
 
 @pytest.mark.parametrize("alpha", [False, True])
@@ -137,13 +137,13 @@ def test_processes_exchange_the_gradients_of_texels_that_a_view_moves(alpha: boo
 
 def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None:
     scene = textured()
-    field = blank_texels(scene, views, len(views), OPTIONS)
-    found = coverage(scene, field, views)
-    assert torch.allclose(field.share, 1 / (found + OPTIONS.prior))
-    half = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views represent all
+    field, _ = blank_texels(scene, views, len(views), OPTIONS)
+    covered = coverage(scene, field, views)
+    assert torch.allclose(field.share, 1 / (covered + OPTIONS.prior))
+    half, _ = blank_texels(scene, views, 2 * len(views), OPTIONS)  # half of the views represent all
     cameras = [view.camera for view in views]
     least = LEAST_COVERAGE * single_view_coverage(scene.surfels, cameras, half.size, half.extent, scene.near).detach()
-    assert torch.allclose(half.share, 1 / (torch.maximum(2 * found, least) + OPTIONS.prior))
+    assert torch.allclose(half.share, 1 / (torch.maximum(2 * covered, least) + OPTIONS.prior))
     with torch.no_grad():
         scene.surfels["sv_rgb"].fill_(0.2)  # avoids clipping
     scene.field, total = field, 0.0
@@ -151,16 +151,16 @@ def test_coverage_is_the_gradient_of_the_summed_picture(textured, views) -> None
         image = scene.render(view.camera).rgb[..., 0]
         total = total + (image if view.mask is None else image * view.mask.reshape(image.shape)).sum()
     total.backward()
-    torch.testing.assert_close(found, field.texels.grad[:, 0], rtol=1e-4, atol=1e-4)
-    assert (found > 0).any()
+    torch.testing.assert_close(covered, field.texels.grad[:, 0], rtol=1e-4, atol=1e-4)
+    assert (covered > 0).any()
 
 
 def test_large_photographs_are_looked_through_at_half_their_size(textured, views, monkeypatch) -> None:
     scene, cameras = textured(), [view.camera for view in views]
-    whole = blank_texels(scene, views, len(views), OPTIONS)
+    whole, _ = blank_texels(scene, views, len(views), OPTIONS)
     pixels = sum(camera.width * camera.height for camera in cameras) // len(cameras)
     monkeypatch.setattr(texels, "SURVEY_PIXELS", pixels // 4)
-    field = blank_texels(scene, views, len(views), OPTIONS)
+    field, _ = blank_texels(scene, views, len(views), OPTIONS)
     halves = [at_size(view, view.camera.scaled(0.5), "cpu") for view in views]
     assert all(half.camera.width == round(0.5 * camera.width) for half, camera in zip(halves, cameras, strict=True))
     found, at_full_size = 4 * coverage(scene, field, halves), coverage(scene, field, views)
@@ -172,7 +172,7 @@ def test_large_photographs_are_looked_through_at_half_their_size(textured, views
 
 def test_views_that_were_not_looked_through_move_no_texel_far(textured, views) -> None:
     scene, far = textured(), 0.0
-    field = blank_texels(scene, views[:1], len(views), OPTIONS)
+    field, _ = blank_texels(scene, views[:1], len(views), OPTIONS)
     counted = coverage(scene, field, views[:1]) * len(views)
     for view in views[1:]:
         seen = coverage(scene, field, [view])

@@ -61,6 +61,14 @@ def camera():
 
 
 @pytest.fixture(scope="session")
+def truth(scene):
+    """A reduced bake, as it is in the photographs."""
+    from tests.bake.test_tune import waving_reduced
+
+    return waving_reduced(scene(60))
+
+
+@pytest.fixture(scope="session")
 def scene():
     def make(count: int = 200, field: object = "wave", kind: str = "sv", seed: int = 0) -> SimpleNamespace:
         field = WaveField() if field == "wave" else field

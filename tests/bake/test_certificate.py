@@ -1,7 +1,6 @@
 """Certificates in bundles are true, and `bitymi verify` measures them again."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +9,14 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bitymi_ns.bake import BakeOptions, Coded, Reduced, RefineOptions, TuneOptions, bake, bake_field, export
+from bitymi_ns.bake import BakeOptions, Coded, Reduced, RefineOptions, TuneOptions, bake, export
 from bitymi_ns.bake.compact import Compact
 from bitymi_ns.bake.tile_errors import cells_per_pixel, closest_pixels, listed_errors, moving_average
 from bitymi_ns.bake.tiles import TileVisibility
 from bitymi_ns.bundle import check_files
 from bitymi_ns.bundle.statistics import Certificate
 from bitymi_ns.scene.visibility import visibility
-from tests.bake.test_tune import BACKGROUND, photographs, waving_reduced
+from tests.bake.test_tune import BACKGROUND, photographs
 from tests.bundle.damage import amend, recode
 
 SIDES = ((0, 0), (4, 4), (8, 4), (8, 16))
@@ -109,19 +108,14 @@ def test_the_counts_are_true(seed: int, size: float) -> None:
         assert stated.worst == pytest.approx(max(found), rel=1e-3, abs=1e-4)
 
 
-@pytest.fixture(scope="module")
-def truth(scene) -> Reduced:
-    return waving_reduced(scene(60))
-
-
 @pytest.fixture(scope="module", params=[True, False], ids=["compact", "pages"])
 def tuned(scene, truth: Reduced, request: pytest.FixtureRequest) -> Coded:
     compact, made, views = request.param, scene(60), photographs(truth)
     made.surfels["log_scales"] += 1.5
     made.surfels["opacity_logits"] += 1.0
     refine = RefineOptions(tune=TuneOptions(steps=2, coded_steps=10), compact=Compact() if compact else None)
-    at = ([view.camera for view in views], views, BACKGROUND)
-    return bake(made, *at, BakeOptions(format="uint8"), refine)
+    seen = ([view.camera for view in views], views, BACKGROUND)
+    return bake(made, *seen, BakeOptions(format="uint8"), refine)
 
 
 def test_what_is_stated_is_true_and_other_integers_fail(tuned: Coded, truth: Reduced, tmp_path: Path) -> None:
@@ -146,15 +140,3 @@ def test_counts_that_contradict_each_other_fail(tuned: Coded, tmp_path: Path) ->
     export(tuned, tmp_path / "b")
     amend(tmp_path / "b", lambda info: info["statistics"]["certificate"].update(beyond=0, worst=2.0))
     assert [check.name for check in check_files(tmp_path / "b")[1] if not check.ok] == ["certificate"]
-
-
-def test_a_bake_of_the_field_is_held_against_its_texels(scene, camera, tmp_path: Path) -> None:
-    made, views = scene(40), [camera(6.0), camera(40.0)]
-    options = BakeOptions(format="uint8", tolerance=0.3)
-    baked = bake_field(made, views, options)
-    stated = baked.statistics.certificate
-    assert stated.against == "texels" and stated.within > 0
-    export(baked, tmp_path / "b", statistics={"options": vars(options)})
-    _, checks = check_files(tmp_path / "b")
-    assert all(check.ok for check in checks) and "certificate" in {check.name for check in checks}
-    assert bake_field(made, views, replace(options, tolerance=0.0)).statistics.certificate is None

@@ -14,13 +14,7 @@ from bitymi_ns.bake.compact import ENOUGH, MAX_LAMBDA, START, TEXEL_SHARE, Coder
 from bitymi_ns.bake.precision import PER_BIT
 from bitymi_ns.bundle import check_files
 from bitymi_ns.train.views import View
-from tests.bake.test_tune import BACKGROUND, photographs, render, waving_reduced
-
-
-@pytest.fixture(scope="module")
-def truth(scene) -> Reduced:
-    """The scene in the photographs."""
-    return waving_reduced(scene(60))
+from tests.bake.test_tune import BACKGROUND, photographs, render
 
 
 @pytest.fixture(scope="module")

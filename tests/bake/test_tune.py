@@ -81,12 +81,6 @@ def photographs(truth: Stage) -> list[View]:
 
 
 @pytest.fixture(scope="module")
-def truth(scene) -> Reduced:
-    """The scene in the photographs."""
-    return waving_reduced(scene(60))
-
-
-@pytest.fixture(scope="module")
 def views(truth: Reduced) -> list[View]:
     return photographs(truth)
 

@@ -34,18 +34,20 @@ def views(n: int, count: int = 9, seed: int = 0, spread: float = 1.0) -> tuple[t
     return seen, centers.double()
 
 
+def whole_and_reduced(kind, params, reduced, d):
+    """Evaluate both in directions d [n, 3] float64."""
+    whole = getattr(reference, kind)(*(params[name].double() for name in VIEW_COLORS[kind].names), d)
+    base, span, terms = (reduced[name] for name in REDUCED)
+    return whole, reference.reduced(kind, base.double(), span, terms.double(), d)
+
+
 def exact_errors(kind, params, reduced, means, seen, centers, opacity):
-    found = torch.zeros(len(means), dtype=torch.float64)
-    full = [params[name].double() for name in VIEW_COLORS[kind].names]
+    largest = torch.zeros(len(means), dtype=torch.float64)
     for view, center in zip(seen, centers, strict=True):
-        d = F.normalize(means.double() - center, dim=1)
-        a = getattr(reference, kind)(*full, d)
-        b = reference.reduced(
-            kind, reduced["view_base"].double(), reduced["view_span"], reduced["view_terms"].double(), d
-        )
+        a, b = whole_and_reduced(kind, params, reduced, F.normalize(means.double() - center, dim=1))
         error = 255 * ((a + 0.5).relu() - (b + 0.5).relu()).abs().amax(1) * opacity
-        found = torch.where(view, torch.maximum(found, error), found)
-    return found
+        largest = torch.where(view, torch.maximum(largest, error), largest)
+    return largest
 
 
 @settings(deadline=None, max_examples=25)
@@ -65,19 +67,20 @@ def test_the_bound_holds_in_every_view(surfels, kind, seed, tolerance, spread):
 def test_directions_are_those_of_the_views_and_others_between(surfels):
     n = 12
     means, (seen, centers) = surfels(n)["means"], views(n)
-    found = {}
-    for at in view_directions(means, seen, centers):
-        assert torch.allclose(at.unit.norm(dim=2), torch.ones(()), atol=1e-5)
-        for row, unit, valid in zip(at.rows.tolist(), at.unit, at.valid, strict=True):
-            found[row] = (unit[: at.views][valid[: at.views]], unit[at.views :][valid[at.views :]])
-    assert sorted(found) == list(range(n)) and len(found[0][0]) == 0 and len(found[0][1]) == SPHERE
+    of_rows = {}
+    for chunk in view_directions(means, seen, centers):
+        assert torch.allclose(chunk.unit.norm(dim=2), torch.ones(()), atol=1e-5)
+        for row, *values in zip(chunk.rows.tolist(), chunk.unit, chunk.valid, strict=True):
+            (own, rest), (own_valid, rest_valid) = ((v[: chunk.views], v[chunk.views :]) for v in values)
+            of_rows[row] = own[own_valid], rest[rest_valid]
+    assert sorted(of_rows) == list(range(n)) and len(of_rows[0][0]) == 0 and len(of_rows[0][1]) == SPHERE
     for row in range(1, n):
         own = F.normalize(means[row].double() - centers[seen[:, row]], dim=1).float()
-        seen_from, between = found[row]
+        seen_from, between = of_rows[row]
         assert torch.allclose(seen_from, own, atol=1e-6) and len(between) == BETWEEN
         middle = F.normalize(own.mean(0), dim=0)
         assert (between @ middle).amin() > 2 * (own @ middle).amin() - 1.01  # not far outside of the views
-    assert torch.allclose(found[1][1], found[1][0].expand(BETWEEN, 3), atol=1e-5)  # one view: always the same
+    assert torch.allclose(of_rows[1][1], of_rows[1][0].expand(BETWEEN, 3), atol=1e-5)  # one view: always the same
 
 
 def test_a_colour_that_no_view_sees_change_is_one_colour(surfels):
@@ -92,11 +95,7 @@ def test_a_colour_that_no_view_sees_change_is_one_colour(surfels):
         params[lobes] = params[lobes] * 1e-5
         reduced = color_choices(params, kind, *views(n), torch.ones(n), 1.0).at()
         assert (reduced["view_span"][:, 1] == 0).all()
-        d = F.normalize(params["means"].double() - views(n)[1][0], dim=1)
-        a = getattr(reference, kind)(*(params[name].double() for name in VIEW_COLORS[kind].names), d)
-        b = reference.reduced(
-            kind, reduced["view_base"].double(), reduced["view_span"], reduced["view_terms"].double(), d
-        )
+        a, b = whole_and_reduced(kind, params, reduced, F.normalize(params["means"].double() - views(n)[1][0], dim=1))
         torch.testing.assert_close(a.clamp(min=-0.5), b, atol=4e-3, rtol=0)
 
 
@@ -120,10 +119,7 @@ def test_without_room_all_sites_are_kept_and_nothing_changes(surfels):
     rest = torch.arange(n) != 1
     assert (reduced["view_span"][rest, 1] == 6).all()
     d = F.normalize(torch.randn(n, 3, generator=torch.Generator().manual_seed(1)), dim=1).double()
-    want = reference.sv(*(params[name].double() for name in VIEW_COLORS["sv"].names), d)
-    got = reference.reduced(
-        "sv", reduced["view_base"].double(), reduced["view_span"], reduced["view_terms"].double(), d
-    )
+    want, got = whole_and_reduced("sv", params, reduced, d)
     torch.testing.assert_close(got[rest], want[rest], atol=1e-5, rtol=1e-5)
 
 
@@ -147,6 +143,7 @@ def test_a_bundle_holds_the_reduced_colours_and_verify_measures_them(scene, came
     assert full.statistics.view_color is None and set(full.scene.surfels) == set(made.surfels)
     export(full, tmp_path / "full")
     whole = read_bundle(tmp_path / "full")
+    assert set(whole.scene.surfels) == set(made.surfels) > set(VIEW_COLORS[kind].names)
     assert whole.info.version == "6.0" and check_view_color(whole, made.surfels, cameras).ok
     saved = stated["bytes"]["before"] - stated["bytes"]["after"]
     sizes = [(tmp_path / name / "surfels.ply").stat().st_size for name in ("full", "b")]

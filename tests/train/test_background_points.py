@@ -21,8 +21,6 @@ from bitymi_ns.train.init import scene_for_views, surfels_from_points
 from bitymi_ns.train.views import View
 
 W, H, DEPTH = 96, 48, 2.0
-
-
 EYE = torch.tensor([1.0, 2.0, -3.0])
 
 
@@ -40,15 +38,6 @@ def camera() -> Camera:
     return turned(20.0)
 
 
-def world(camera: Camera, pixels: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """Unproject pixels [N, 2] with depth [N] to points [N, 3]."""
-    K = camera.K
-    local = torch.stack(
-        [(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], torch.ones(len(pixels))], 1
-    )
-    return (local * depth[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
-
-
 def projected(camera: Camera, points: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
     pixels = local[:, :2] / local[:, 2:] * torch.stack([camera.K[0, 0], camera.K[1, 1]]) + camera.K[:2, 2]
@@ -60,7 +49,7 @@ def left(camera: Camera) -> torch.Tensor:
     """Make points in every cell of the left half."""
     side = W / CELLS
     cells = torch.cartesian_prod(torch.arange(CELLS // 2), torch.arange(int(H / side))).repeat(2 * POINTS_PER_CELL, 1)
-    return world(camera, (cells + 0.5) * side, DEPTH * torch.linspace(0.9999, 1.0001, len(cells)))
+    return camera.unproject(*((cells + 0.5) * side).unbind(1), DEPTH * torch.linspace(0.9999, 1.0001, len(cells)))
 
 
 def test_empty_cells_get_a_point_on_their_ray(camera: Camera, left: torch.Tensor) -> None:
@@ -100,7 +89,7 @@ def test_points_that_few_views_show_or_that_hide_others_go(camera: Camera, left:
     image = torch.rand(H, W, 3)
     assert len(background_points(left, [View(camera, image)] * (SUPPORT - 1), 0).xyz) == 0
     ahead = turned(0.0)
-    points = world(ahead, projected(camera, left)[0], torch.full((len(left),), DEPTH))
+    points = ahead.unproject(*projected(camera, left)[0].unbind(1), torch.full((len(left),), DEPTH))
     assert len(background_points(points, [View(ahead, image)] * SUPPORT, 0).xyz) == SUPPORT * 144
     viewmat = torch.eye(4)  # right of the empty cells, looking left
     viewmat[:3, :3] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
@@ -108,7 +97,7 @@ def test_points_that_few_views_show_or_that_hide_others_go(camera: Camera, left:
     side = Camera(viewmat, torch.tensor([[15.0, 0.0, 48.0], [0.0, 15.0, 24.0], [0.0, 0.0, 1.0]]), W, H)
     pixels = (torch.cartesian_prod(torch.arange(CELLS), torch.arange(12)) + 0.5) * (W / CELLS)
     pixels = pixels.repeat(POINTS_PER_CELL, 1)
-    wall = world(side, pixels, torch.full((len(pixels),), 40.0))
+    wall = side.unproject(*pixels.unbind(1), torch.full((len(pixels),), 40.0))
     views = [View(ahead, image)] * SUPPORT + [View(side, image)] * 3
     assert len(background_points(torch.cat([points, wall]), views, 0).xyz) == 0
 

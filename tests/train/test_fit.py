@@ -186,14 +186,3 @@ def test_views_that_see_nothing_and_runs_of_one_step(make_scene, views):
     fit(make_scene(), views[:1], views[:1], TrainConfig(), 1)
     with pytest.raises(ValueError, match="no views"):
         fit(make_scene(), [], [], TrainConfig(), 1)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("cap", [1, 40, 130, 150])
-def test_the_cap_holds_after_every_step(make_scene, views, cap):
-    scene, seen = make_scene(), []
-    first = len(scene)
-    config = TrainConfig(densify=replace(EVERY_EVENT, max_surfels=cap))
-    fit(scene, views, [], config, 40, callback=lambda t: seen.append(len(t.scene)))
-    assert min(first, cap) <= max(seen) <= cap  # how many are pruned depends on the random numbers
-    assert all(torch.isfinite(p).all() for p in scene.parameters())

@@ -41,13 +41,14 @@ def truth(cameras, ball) -> Scene:
     return Scene(SceneConfig(), surfels, None)
 
 
+def off(view: View, by: Tensor) -> View:
+    return view._replace(camera=view.camera.posed(moved(view.camera.viewmat.double(), by)))
+
+
 @pytest.fixture(scope="module")
 def wrong(views) -> list[View]:
     """The photographs with poses that are a pixel off."""
-    return [
-        view._replace(camera=view.camera.posed(moved(view.camera.viewmat.double(), motion(i, 0.012))))
-        for i, view in enumerate(views)
-    ]
+    return [off(view, motion(i, 0.012)) for i, view in enumerate(views)]
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +64,7 @@ def ring(truth) -> tuple[list[View], list[View]]:
     errors = (torch.stack([motion(i, 0.012) for i in range(24)]) * unit).flatten()
     basis = gauge(torch.stack([camera.exact_center for camera in cameras]), 3.0)
     errors = (errors - basis @ (basis.T @ errors)).view(24, 6) / unit
-    wrong = [
-        view._replace(camera=view.camera.posed(moved(view.camera.viewmat.double(), error)))
-        for view, error in zip(right, errors, strict=True)
-    ]
-    return right, wrong
+    return right, [off(view, error) for view, error in zip(right, errors, strict=True)]
 
 
 def scene_of(ball, views: list[View]) -> Scene:
@@ -96,10 +93,9 @@ def test_a_motion_turns_about_the_centre_and_shifts_it(cameras):
 @pytest.mark.parametrize("size", [0.003, 0.02])
 def test_a_view_is_aligned_with_a_scene_to_a_tenth_of_a_pixel(truth, views, ball, seed, size):
     view = views[seed]
-    off = view.camera.posed(moved(view.camera.viewmat.double(), motion(seed, size)))
-    found = aligned(truth, view._replace(camera=off), None, 0.2)
-    assert apart([found], [view.camera], ball[0]) < 0.1
-    assert view_psnr(truth, view._replace(camera=found), None) > 40.0
+    camera = aligned(truth, off(view, motion(seed, size)), None, 0.2)
+    assert apart([camera], [view.camera], ball[0]) < 0.1
+    assert view_psnr(truth, view._replace(camera=camera), None) > 40.0
     assert all(parameter.grad is None for parameter in truth.parameters())
 
 
@@ -117,8 +113,7 @@ def test_a_gradient_that_is_not_finite_moves_nothing(truth, views, bad):
     gradient = torch.tensor([0, 1, 0, bad, 0, 0], dtype=torch.float64)
     assert pose_step(gradient, output.projection, 0.5).tolist() == [0.0] * 6
     huge = pose_step(torch.full((6,), 1e30, dtype=torch.float64), output.projection, 0.5)
-    there = views[0].camera.posed(moved(views[0].camera.viewmat.double(), huge))
-    assert apart([there], [views[0].camera], truth.surfels["means"].detach()) < 1.0
+    assert apart([off(views[0], huge).camera], [views[0].camera], truth.surfels["means"].detach()) < 1.0
 
 
 @pytest.mark.parametrize(("count", "free"), [(1, 6), (2, 7), (6, 7)])

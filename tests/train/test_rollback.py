@@ -70,8 +70,7 @@ def test_a_field_that_breaks_on_the_way_is_restored(begun, views):
     trainer = begun(50)
     scene = trainer.scene
     good = scene.field.field_table.detach().clone()
-    with torch.no_grad():
-        scene.field.field_w3[4] = math.nan
+    scene.field.field_w3.data[4] = math.nan
     message = r"step 5\d: training diverged .*field_w3 is not finite.*learning rates times 0.3"
     with pytest.warns(UserWarning, match=message):
         for _ in range(20):
@@ -94,8 +93,7 @@ def test_a_field_that_breaks_just_before_a_prune_is_restored(make_scene, views):
     step = trainer.training.strategy.step
 
     def broken(*arguments):
-        with torch.no_grad():
-            scene.field.field_w3[4] = math.nan
+        scene.field.field_w3.data[4] = math.nan
         trainer.training.strategy.step = step
         return step(*arguments)
 
@@ -111,8 +109,7 @@ def test_views_drawn_worse_than_blank_ones_take_the_run_back(begun, views):
     trainer = begun(100)
     good = evaluate(trainer.scene, views, trainer.config).psnr
     assert trainer.training.guard.window == 20  # windows end with the run
-    with torch.no_grad():
-        trainer.scene.surfels["sv_rgb"] += 5.0
+    trainer.scene.surfels["sv_rgb"].data += 5.0
     with pytest.warns(UserWarning, match="step 119: training diverged .the views are drawn worse than blank ones"):
         for _ in range(20):
             trainer.advance()
@@ -138,15 +135,13 @@ def test_a_few_broken_surfels_are_dropped_and_many_take_the_run_back(begun):
     trainer = begun(30, of=200, every=2)
     scene = trainer.scene
     before = len(scene)
-    with torch.no_grad():
-        scene.surfels["sv_rgb"][3] = math.nan  # the loss is not finite
-        scene.surfels["quats"][7] = math.inf  # not drawn, without effect on the loss
+    scene.surfels["sv_rgb"].data[3] = math.nan  # the loss is not finite
+    scene.surfels["quats"].data[7] = math.inf  # not drawn, without effect on the loss
     with pytest.warns(UserWarning, match="2 surfels were no longer finite and were dropped"):
         trainer.advance()
     assert len(scene) == before - 2 and not describe_broken(scene) and trainer.training.guard.rollbacks == 0
     run(trainer, 20)
-    with torch.no_grad():
-        scene.surfels["means"][:60] = math.nan
+    scene.surfels["means"].data[:60] = math.nan
     with pytest.warns(UserWarning, match="means is not finite in 60 of .* rows"):
         (report,) = (r for r in (trainer.advance()[2] for _ in range(trainer.training.guard.window)) if "rates" in r)
     assert report["rolled_back"] > 0 and report["rates"] == pytest.approx(0.3) and not describe_broken(scene)
@@ -171,8 +166,7 @@ def test_it_does_not_go_back_for_ever(begun):
     trainer = begun(5, config=config_of(rollbacks=2, rates=0.5))
     with pytest.raises(TrainingDiverged, match=r"after 2 rollbacks .rates times 0.25.: .* Lower"):
         for _ in range(3):
-            with torch.no_grad():
-                trainer.scene.field.field_w1[0] = math.inf
+            trainer.scene.field.field_w1.data[0] = math.inf
             run(trainer, 1)
 
 
@@ -187,8 +181,7 @@ def test_images_that_are_not_finite_are_named_and_nothing_goes_back(make_scene, 
 
 def test_a_resumed_run_keeps_its_lowered_rates(begun):
     trainer = begun(30)
-    with torch.no_grad():
-        trainer.scene.field.field_w3[4] = math.nan
+    trainer.scene.field.field_w3.data[4] = math.nan
     run(trainer, 2)
     resumed = begun(0, every=5)
     resume(resumed, state_of(trainer))

@@ -81,29 +81,20 @@ def test_a_step_moves_near_and_far_surfels_by_as_many_pixels(make_scene, views: 
     torch.testing.assert_close(moved[touched], want, rtol=1e-2, atol=0)
 
 
-def scaled(views: list[View], by: float) -> list[View]:
-    """Scale the world of the photographs."""
-    found = []
-    for view in views:
-        viewmat = view.camera.viewmat.clone()
-        viewmat[:3, 3] *= by
-        found.append(view._replace(camera=Camera(viewmat, view.camera.K, view.camera.width, view.camera.height)))
-    return found
-
-
 def test_the_scale_of_a_capture_changes_nothing(views: list[View], ball: tuple[Tensor, Tensor]) -> None:
     losses = []
     for by in (1.0, 256.0, 2.0**-7):
         xyz, rgb = (t[::6] for t in ball)
         config = TrainConfig(resolution_schedule=0)
-        here = scaled(views, by)
+        unit = torch.tensor([1.0, 1.0, 1.0, by])  # of the columns of poses
+        here = [view._replace(camera=view.camera.posed(view.camera.viewmat * unit)) for view in views]
         trainer = Trainer(scene_for_views(here, xyz * by, rgb, SceneConfig(texture="none"), config), here, config, 60)
         advanced(trainer, 60)
         losses.append(trainer.loss)
     assert losses[1:] == pytest.approx(losses[:1] * 2, rel=0.05)
 
 
-def fine(views: list[View], by: float, ball: tuple[Tensor, Tensor]) -> tuple[list[View], Tensor, Tensor]:
+def fine(views: list[View], by: float) -> list[View]:
     """Make the scene small in its capture: cameras farther away with longer lenses, one of them on the other side of
     the world, so that the extent is large."""
     found = []
@@ -114,7 +105,7 @@ def fine(views: list[View], by: float, ball: tuple[Tensor, Tensor]) -> tuple[lis
         K = camera.K.clone()
         K[0, 0], K[1, 1] = by * K[0, 0], by * K[1, 1]
         found.append(view._replace(camera=Camera(viewmat, K, camera.width, camera.height)))
-    return found, *ball
+    return found
 
 
 @pytest.mark.parametrize("by", [1.0, 30.0])
@@ -122,11 +113,10 @@ def test_texels_keep_the_picture_of_a_scene_with_a_large_extent(
     views: list[View], ball: tuple[Tensor, Tensor], by: float
 ) -> None:
     """With steps relative to the extent, 30 times as many pixels per step, training diverges."""
-    here, xyz, rgb = fine(views, by, ball)
-    losses = {}
+    here, losses = fine(views, by), {}
     for name, rates in {"pixels": LearningRates(), "extent": LearningRates(means=(1.6e-4, 1.6e-6))}.items():
         config = TrainConfig(lr=rates, resolution_schedule=0, texels=TexelConfig(start=18_000))
-        scene = scene_for_views(here, xyz, rgb, SceneConfig(texture="texels"), config)
+        scene = scene_for_views(here, *ball, SceneConfig(texture="texels"), config)
         trainer = Trainer(scene, here, config, 300)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")

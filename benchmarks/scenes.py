@@ -80,7 +80,7 @@ def with_texels(n: int, width: int, height: int, device: torch.device) -> tuple[
     """Generate `trained_like` with a tile of random texels per surfel, at the camera's resolution."""
     scene, camera = trained_like(n, width, height, device, texture=False)
     scene.config.texture = "texels"
-    field = blank_texels(scene, [View(camera, torch.zeros(height, width, 3, device=device))], 1, TexelConfig())
+    field, _ = blank_texels(scene, [View(camera, torch.zeros(height, width, 3, device=device))], 1, TexelConfig())
     g = torch.Generator().manual_seed(1)
     with torch.no_grad():
         field.texels.copy_(0.1 * torch.randn(field.texels.shape, generator=g))

@@ -40,7 +40,7 @@ class BakeOptions:
     is within it, over directions in and around the training views that see the surfel. 0: tile sizes by the Nyquist
     rule, view colours unchanged."""
     local_voxel: bool = True
-    """Choose the size of a tile by the field's voxels at the surfel; False: by its smallest, as in the paper."""
+    """Choose a tile's size by the field's voxels at the surfel; False: by the scene's smallest, as in the paper."""
     cap_by_views: bool = True
     """Limit the texels of a tile to the pixels it covers in the training view that sees it largest."""
     drop_unseen: bool = True

@@ -46,7 +46,7 @@ class Ktx2Error(ValueError):
 class Ktx2Image:
     """A 2D array texture."""
 
-    format: Format  # one of bc7, uint8, fp16
+    format: Format
     # width, height: in texels
     width: int
     height: int
@@ -56,7 +56,6 @@ class Ktx2Image:
 
 
 def layer_bytes(format: Format, width: int, height: int) -> int:
-    """Compute the bytes of a layer of `width` x `height` texels."""
     layout = _LAYOUTS[format]
     return -(-width // layout.block) * -(-height // layout.block) * layout.block_bytes
 

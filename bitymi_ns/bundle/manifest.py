@@ -72,9 +72,8 @@ def points_of(text: str) -> Tensor:
     except (binascii.Error, ValueError) as error:
         raise PydanticCustomError("points", "must be base64 of float32 numbers") from error
     if len(data) % 16 or len(data) > 16 * _MOST_POINTS:
-        raise PydanticCustomError(
-            "points", "must hold rows of four float32 numbers, at most {most}", {"most": _MOST_POINTS}
-        )
+        told = "must hold rows of four float32 numbers, at most {most}"
+        raise PydanticCustomError("points", told, {"most": _MOST_POINTS})
     points = torch.from_numpy(np.frombuffer(bytearray(data), "<f4").reshape(-1, 4))
     low, high = _RATES
     good = (points[:, :3].abs() <= LIMITS["means"][0]).all() and ((points[:, 3] >= low) & (points[:, 3] <= high)).all()
@@ -157,26 +156,15 @@ class AtlasEntry(Part):
     psnr: Decibels = None
 
     @model_validator(mode="after")
-    def _half_floats_are_residuals(self) -> AtlasEntry:
-        if self.format == "fp16" and (self.offset, self.scale) != (0.0, 1.0):
+    def _fits_its_format(self) -> AtlasEntry:
+        format, coded = self.format, self.format == "dct"
+        if format == "fp16" and (self.offset, self.scale) != (0.0, 1.0):
             raise PydanticCustomError("range", "must have offset 0 and scale 1, as its format is fp16")
-        return self
-
-    @model_validator(mode="after")
-    def _alphas_are_drawn(self) -> AtlasEntry:
-        scale = 1.0 if self.format == "fp16" else ALPHA_SCALE
+        scale = 1.0 if format == "fp16" else ALPHA_SCALE
         if self.alpha_scale not in (None, scale):
-            raise PydanticCustomError(
-                "alpha",
-                "must have alpha_scale {scale}, as its format is {format}",
-                {"scale": scale, "format": self.format},
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _file_fits(self) -> AtlasEntry:
+            told = "must have alpha_scale {scale}, as its format is {format}"
+            raise PydanticCustomError("alpha", told, {"scale": scale, "format": format})
         parts = (self.texels, self.step, self.page_width, self.page_rows, self.columns)
-        coded = self.format == "dct"
         if coded != (self.file == TEXELS) or (coded and None in parts):
             raise PydanticCustomError("file", "file, format, texels, step, pages and columns do not fit each other")
         return self
@@ -238,10 +226,6 @@ class Manifest(Part):
         for name in (ATLAS, TEXELS):
             if (name in self.files) != (name == atlas):
                 raise PydanticCustomError("files", f"files and atlas disagree whether there is an {name}")
-        return self
-
-    @model_validator(mode="after")
-    def _surfels_fit(self) -> Manifest:
         surfels, compact = self.surfels, self.surfels.file == COMPACT_SURFELS
         if compact and None in (surfels.frame, surfels.columns, surfels.terms):
             raise PydanticCustomError("file", "surfels.bin needs surfels.frame, columns and terms")

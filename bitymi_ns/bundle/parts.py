@@ -195,12 +195,12 @@ def notes_data(parts: Parts) -> bytes | None:
 
 
 def bundle_at(path: Path) -> Path | None:
-    """Find the bundle of a path: the path itself, or its parent (as for config.yml); None if there is none."""
+    """Find the bundle of a path: itself, or its parent (as for config.yml)."""
     return next((place for place in (path, path.parent) if (place / MANIFEST).is_file() or _is_archive(place)), None)
 
 
 def instead_of(path: Path) -> str | None:
-    """Explain a path that is not a bundle and suggest another; None if nothing is known."""
+    """Explain a path that is not a bundle and suggest another, if possible."""
     if not os.path.lexists(path):
         return "it does not exist"
     bundle = next((place for place in (path.parent, path / "bundle") if (place / MANIFEST).is_file()), None)
@@ -232,8 +232,8 @@ def check_target(folder: str | Path, overwrite: bool = False) -> None:
 
 @contextmanager
 def reserved_bundle(folder: str | Path, overwrite: bool, tell: Tell = warnings.warn, then: str = "") -> Iterator[None]:
-    """Lock the folder of a bundle for the block, before the work of baking it; `then` ends the message of an error.
-    Raises BundleError: as `check_target`, or the folder is in use or cannot be written."""
+    """Lock the folder of a bundle for the block; `then` ends the message of an error. Raises BundleError: as
+    `check_target`, or the folder is in use or cannot be written."""
     folder = Path(folder)
     with ExitStack() as stack:
         with write_errors_as(folder, BundleError, then):

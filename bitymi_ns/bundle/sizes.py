@@ -58,8 +58,8 @@ def check_memory(bundle: Path, info: Manifest, name: str) -> None:
     needed."""
     least, there = least_memory(info, name), machine_memory()
     if least > there:
-        needs = f"{bundle / name} needs more memory than there is: its contents take at least {size_text(least)}"
-        raise BundleError(f"{needs}, this machine has {size_text(there)}")
+        takes = f"its contents take at least {size_text(least)}, this machine has {size_text(there)}"
+        raise BundleError(f"{bundle / name} needs more memory than there is: {takes}")
 
 
 def least_memory(info: Manifest, name: str) -> int:

@@ -15,8 +15,8 @@ _P = TypeVar("_P", bound="Part")
 
 
 class Part(BaseModel):
-    """An object of bundle.json. Unknown keys are kept and ignored; numbers are finite and never bools or text. Only
-    fields that were set are written."""
+    """An object of bundle.json. Unknown keys are kept; numbers are finite and never bools or text. Only fields that
+    were set are written."""
 
     model_config = ConfigDict(strict=True, extra="allow", allow_inf_nan=False)
 
@@ -183,7 +183,7 @@ class HeldOut(Part):
 
 
 class Statistics(Part):
-    """Statistics for readers and reports; `bitymi verify` measures them again."""
+    """Statistics for reports; `bitymi verify` measures them again."""
 
     surfels: KeptSurfels | None = None
     texels: KeptTexels | None = None

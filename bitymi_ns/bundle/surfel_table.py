@@ -45,8 +45,8 @@ COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> Tensor:
-    """Average f_view over all directions, without the bias 0.5, for display: [N, 3]. By the closed form of the kind
-    (`ViewColor.mean`) if there is one; else, and for reduced colours (which need `kind`), over 32 directions."""
+    """Average f_view over all directions, without the bias 0.5: [N, 3]. By the closed form of the kind, if there is
+    one; else, and for reduced colours, which need `kind`, over 32 directions."""
     kind = kind or kind_of(surfels)
     entry = VIEW_COLORS[kind]
     if entry.mean is not None and "view_terms" not in surfels:
@@ -57,8 +57,8 @@ def mean_view_color(surfels: Mapping[str, Tensor], kind: str | None = None) -> T
 
 
 def to_columns(scene: BakedScene, has_alpha: bool = False) -> dict[str, npt.NDArray]:
-    """Convert a scene to the columns of surfels.ply, without the terms of reduced view colours (`term_columns`). Mean
-    residuals are included in the colour that other viewers show; residuals and extents get columns if present."""
+    """Convert a scene to the columns of surfels.ply, without the terms of reduced view colours (`term_columns`). The
+    colour that other viewers show includes the mean residuals."""
     kind, surfels, tiles = scene.view_color, scene.surfels, scene.tiles.numpy()
     reduced = "view_terms" in surfels
     surfels = {name: _plain(value) for name, value in surfels.items()}
@@ -138,13 +138,12 @@ def from_columns(
     Args:
         columns: of element `vertex`.
         kind: a name of `ops.VIEW_COLORS`.
-        terms: columns of element `view_term`, for reduced view colours; None if absent.
+        terms: columns of element `view_term`, for reduced view colours.
         extent: half side of the tiles in scale units if there is no column.
         has_alpha: require mean alphas.
 
-    Returns fields of `BakedScene`: surfels, float32 per-surfel parameters (unit quaternions); tiles [N, 5] int32;
-    extent [N]; mean_residual [N, 3], 0 without its columns; mean_alpha [N] or None. Raises PlyError: a column is
-    missing or of the wrong type, the view colour has the wrong number of columns, or a value is beyond its limit."""
+    Returns fields of `BakedScene`, with unit quaternions. Raises PlyError: a column is missing or of the wrong type,
+    the view colour has the wrong number of columns, or a value is beyond its limit."""
     if kind not in VIEW_COLORS:
         raise PlyError(f"the view colour {kind!r} is none of {sorted(VIEW_COLORS)}")
     tiles = _stack(columns, TILE_COLUMNS, np.int32)

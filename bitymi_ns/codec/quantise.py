@@ -47,7 +47,7 @@ class Range:
 class Atlas:
     """Format of an atlas, and the error of its quantisation."""
 
-    format: Format  # one of bc7, uint8, fp16
+    format: Format
     # width, height: page size in texels
     width: int
     height: int
@@ -68,14 +68,14 @@ class Atlas:
 class EncodedAtlas(Atlas):
     """An atlas in its stored format."""
 
-    payload: list[bytes]  # one bytes object per page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top
+    payload: list[bytes]  # by page: BC7 blocks, RGBA8 texels, or RGBA half floats, rows from the top
 
     @property
     def nbytes(self) -> int:
         return sum(len(page) for page in self.payload)
 
     def pages(self) -> Tensor:
-        """Decode to stored texels as `decode_pages`."""
+        """Decode as `decode_pages`."""
         return torch.from_numpy(decode_pages(self.payload, self.format, self.width, self.height))
 
     def decoded(self) -> npt.NDArray[np.float32]:
@@ -118,13 +118,11 @@ def encode(
     format: Format = "bc7",
     value_range: Range | None = None,
     profile: Profile = "veryfast",
-    threads: int | None = None,
     progress: Progress = no_progress,
 ) -> EncodedAtlas:
     """Quantise and encode texels [layers, height, width, C] float32, residual colours and, where C = 4, alphas, and
     measure the error of the colours inside the tiles. `format`: bc7 (1 byte per texel), uint8 (RGBA, 4) or fp16 (RGBA
-    half floats, 8). `value_range`: not used by fp16; None: `choose_range` with its defaults. `threads`: of the encoder;
-    None: one per processor."""
+    half floats, 8). `value_range`: not used by fp16; None: `choose_range` with its defaults."""
     if format not in BYTES_PER_TEXEL:
         raise ValueError(f"the atlas format must be bc7, uint8 or fp16, not {format!r}")
     layers, height, width, channels = texels.shape
@@ -148,7 +146,7 @@ def encode(
     strips = [(layer, top) for layer in range(layers) for top in range(0, height, STRIP)]
     pages: list[list[bytes]] = [[] for _ in texels]
     clipped, squares = 0, 0.0
-    with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
         results = pool.map(lambda at: strip(*at), strips)
         for done, ((layer, _), (data, clips, square)) in enumerate(zip(strips, results, strict=True), start=1):
             pages[layer].append(data)

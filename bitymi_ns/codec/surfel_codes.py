@@ -30,8 +30,8 @@ REFERENCE: dict[str, float] = {
     "term_shape": 1.0 / 12,
     "term_color": 1.0 / 64,
 }
-"""Reference steps of the columns whose precision is chosen; near them an error is about proportional to its step.
-Units: place (positions) as in `PositionGrid`, opacity and beta shares of their ranges, term_shape asinh."""
+"""Reference steps of the columns whose precision is chosen. Units: place (positions) as in `PositionGrid`, opacity and
+beta shares of their ranges, term_shape asinh."""
 CODED = {parameter.code: name for name, parameter in GEOMETRY_PARAMETERS.items() if parameter.code}
 """Surfel parameter of each column whose name differs."""
 
@@ -96,7 +96,7 @@ class SurfelCodes:
         return torch.from_numpy(extent.astype(np.float32)).clamp(*EXTENTS)
 
     def surfels(self) -> dict[str, Tensor]:
-        """Decode the parameters, float32, with reduced view colours."""
+        """Decode the parameters, float32."""
         entry, (colors, shapes) = VIEW_COLORS[self.kind], term_numbers(self.kind)
         terms = np.zeros((len(self.codes["term_color"]), entry.reduced_width))
         count = self.codes["view_count"][:, 0]
@@ -139,10 +139,10 @@ class SurfelCodes:
 def code_surfels(
     surfels: Mapping[str, Tensor], kind: str, sizes: npt.ArrayLike, extent: Tensor, steps: Mapping[str, float]
 ) -> tuple[SurfelCodes, Tensor]:
-    """Quantise surfels and sort them in Morton order; returns the codes, and their order: [N] int64 rows of `surfels`.
-    `surfels`: on the CPU, with reduced view colours. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none.
-    `extent`: [N] half sides of the tiles, scale units. `steps`: by column, as in `REFERENCE`; the step of place grows
-    if its cells would exceed `POSITION_BITS`."""
+    """Quantise surfels, on the CPU with reduced view colours, and sort them in Morton order; returns the codes, and
+    their order: [N] int64 rows of `surfels`. `sizes`: [N, 2] sides of the tiles, texels; (0, 0) = none. `extent`: [N]
+    half sides of the tiles, scale units. `steps`: by column, as in `REFERENCE`; that of place grows if its cells would
+    exceed `POSITION_BITS`."""
     values = {name: value.detach().double().numpy() for name, value in surfels.items()}
     frame, step, cell = _grid_cells(values["means"], steps["place"])
     steps = {**steps, "place": step}

@@ -101,8 +101,7 @@ class TexelCodes:
 
     sizes: Tensor  # [N, 2] int64 sides of the tiles; (0, 0) = one constant
     step: float  # of coefficients at grade 0, colour units
-    # [N, 3] int64 mean of each tile, or the constant, in steps: green, red - green, blue - green
-    residual: npt.NDArray[np.int64]
+    residual: npt.NDArray[np.int64]  # [N, 3] mean of each tile, or the constant: green, red - green, blue - green
     residual_step: float  # colour units
     grades: Tensor  # [tiles] int64
     # per entry of `blocks_of(sizes)`: int32 [coefficients, B, 3], with channels (r + g + b) / sqrt(3),
@@ -145,7 +144,7 @@ class TexelCodes:
 
     @property
     def means(self) -> Tensor:
-        """[N, C] mean residuals and, if there are any, mean alphas."""
+        """[N, C] means of `decoded`."""
         return joined(self.constants, None if self.alpha is None else self.alpha.means)
 
     def alphas(self) -> Tensor | None:
@@ -181,7 +180,7 @@ class SceneCodes:
 
     surfels: SurfelCodes  # of N surfels
     texels: TexelCodes | None  # None without tiles
-    residual: npt.NDArray[np.int64]  # [N, 3] int64 mean residuals: green, red - green, blue - green
+    residual: npt.NDArray[np.int64]  # [N, 3] mean residuals: green, red - green, blue - green
     residual_step: float  # colour units
     # page_width, page_rows: arguments of `packing.pack`
     page_width: int
@@ -189,7 +188,7 @@ class SceneCodes:
 
     @property
     def alpha(self) -> npt.NDArray[np.int64] | None:
-        """[N] int64 mean alphas, 0 to 255, 128 = 1; None if opaque."""
+        """[N] mean alphas, 128 = 1; None if opaque."""
         return None if self.texels is None or self.texels.alpha is None else self.texels.alpha.mean
 
 
@@ -213,8 +212,7 @@ class TexelCoder:
         self.alpha: AlphaCodes | None = None if first is None else first.alpha
 
     def fit(self, texels: Tensor, most_bytes: float, rounds: int = SPARSE_ROUNDS) -> TexelCodes:
-        """Code texels [T, 3] in at most `most_bytes`, alphas included, enlarging the step if needed: bytes fall about
-        as 1 / step."""
+        """Code texels [T, 3] in at most `most_bytes`, alphas included, enlarging the step if needed."""
         codes = self.code(texels, rounds)
         for _ in range(_ATTEMPTS):
             size = codes.nbytes()

@@ -18,15 +18,8 @@ CHANNELS = {"rgb": slice(0, 3), "alpha": slice(3, 4), "beta": slice(4, 5), "dept
 
 
 def gather(atlas: Tensor | None, tiles: Tensor) -> Any:
-    """Gather each surfel's tile into contiguous memory, as the kernel reads it.
-
-    Args:
-        atlas: [layers, height, width, 4] uint8 or float32 on the CPU; None: no tiles.
-        tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
-
-    Raises:
-        ValueError: the tile of a surfel lies outside its page.
-    """
+    """Gather each surfel's tile, of `BakedScene`'s atlas and tiles, into contiguous memory, as the kernel reads it.
+    Raises ValueError: the tile of a surfel lies outside its page."""
     layers, height, width = (0, 0, 0) if atlas is None else atlas.shape[:3]
     texels = {} if atlas is None else {"bytes" if atlas.dtype == torch.uint8 else "floats": atlas}
     patches = lookup("Patches", tiles.device)
@@ -41,17 +34,11 @@ def coarser(atlas: Tensor, tiles: Tensor, alpha: bool) -> dict[str, Any]:
 def frame(
     scene: BakedSceneLike, camera: CameraLike, maps: bool, photo_pixel: float = 1.0
 ) -> tuple[Tensor, Tensor | None]:
-    """Draw a view.
-
-    Args:
-        scene: N surfels, on the CPU.
-        camera: of an H x W view.
-        maps: also draw beta, depth, normal and overdraw.
-        photo_pixel: side of a photograph's pixel in pixels of the view.
+    """Draw a view without background; `photo_pixel`: as in `baked.draw`.
 
     Returns:
         [H, W, 4] rgb and alpha, or [H, W, 9] with maps, adding the sums of w beta, w z and w n; and with maps the
-        number of blended surfels per pixel, [H, W, 1] int32. The background is not included.
+        number of blended surfels per pixel, [H, W, 1] int32.
 
     Raises:
         ValueError: the atlas exists only as BC7 blocks.

@@ -59,17 +59,9 @@ class Sheet(NamedTuple):
 
 
 class AtlasTexture:
-    """A texture with the texels of a sheet.
-
-    Args:
-        texels: [height, width, 4] uint8, or float16 or float32 (stored as float16); or BC7 blocks
-            [height / 4, width / 4, 16] uint8. On the CPU.
-        blocks: whether `texels` are BC7 blocks.
-
-    Raises:
-        ValueError: more texels than a texture can have.
-        RuntimeError: not enough memory, or BC7 is not supported.
-    """
+    """A texture with the texels of a sheet, on the CPU: [height, width, 4] uint8, or float16 or float32 (stored as
+    float16); or, if `blocks`, BC7 blocks [height / 4, width / 4, 16] uint8. Raises ValueError: more texels than a
+    texture can have. Raises RuntimeError: not enough memory, or BC7 is not supported."""
 
     def __init__(self, texels: Tensor, blocks: bool, device: torch.device) -> None:
         side, self._device = 4 if blocks else 1, device
@@ -106,10 +98,8 @@ class Atlas(NamedTuple):
         pages = pages.detach().cpu()
         if blocks and not draws_blocks(device):
             pages, blocks = decoded(pages), False
-            warnings.warn(
-                f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory",
-                stacklevel=2,
-            )
+            told = f"the device '{device}' draws no BC7 textures: the atlas was decoded, at four times the memory"
+            warnings.warn(told, stacklevel=2)
         side = 4 if blocks else 1
         count, height, width = pages.shape[:3]
         sheet = Sheet.of(count, side * height, side * width)
@@ -122,17 +112,10 @@ class Atlas(NamedTuple):
 
 
 def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
-    """Prepare the scene for the kernels (`BakedScene` of csrc/cuda/baked.h), with its atlas as textures. The result
-    keeps all memory it refers to alive, so that recorded CUDA graphs stay valid.
-
-    Args:
-        scene: on a CUDA device.
-        photo_pixel: as in `baked.draw`; below 1 the levels of the tiles are added.
-
-    Raises:
-        TypeError: the surfels are not float32.
-        ValueError: a parameter of the view colour has a wrong shape.
-    """
+    """Prepare a scene on a CUDA device for the kernels (`BakedScene` of csrc/cuda/baked.h), with its atlas as textures,
+    for `photo_pixel` (`baked.draw`) below 1 also the levels of its tiles. The result keeps all memory it refers to
+    alive, so that recorded CUDA graphs stay valid. Raises TypeError: the surfels are not float32. Raises ValueError: a
+    parameter of the view colour has a wrong shape."""
     device = scene.tiles.device
     for name, value in scene.surfels.items():
         if value.dtype != torch.float32 and name != "view_span":

@@ -17,7 +17,7 @@ from .project import CameraLike
 
 
 class Stage(IntFlag):
-    """Stages of a frame, for timing; each needs the results of the previous ones in the working memory."""
+    """Stages of a frame, for timing; drawing needs the lists in the working memory."""
 
     LIST = 1
     DRAW = 2
@@ -30,8 +30,8 @@ def tiles_of(views: int, width: int, height: int) -> int:
 
 
 def slots_per_tile(capacity: int, tiles: int) -> int:
-    """Choose the slots for the pairs of each screen tile: twice the mean of `capacity` pairs, more if all fit in 32 MB,
-    at most what a block of threads sorts at once. Further pairs share one list of all tiles."""
+    """Choose the slots for each screen tile's pairs: twice the mean of `capacity`, more if all fit in 32 MB, at most
+    what a block of threads sorts at once. Further pairs share one list of all tiles."""
     return max(32, min(1024, max(2 * capacity, 1 << 23) // tiles) // 32 * 32)
 
 
@@ -73,7 +73,7 @@ class Workspace:
 
     @property
     def pairs(self) -> int:
-        """Return the pairs of surfel and tile in the latest non-empty frame; waits for the device."""
+        """All pairs of `counts`."""
         return self.counts()[0]
 
 
@@ -134,8 +134,8 @@ class BakedRenderer:
 
         Args:
             cameras: one per view, of the renderer's size.
-            check: wait for the frame and render it again if the working memory was too small. If False, the frame is
-                only started; call `complete` later.
+            check: wait for the frame and render it again if the working memory was too small; False: only start it, and
+                call `complete` later.
             background: [3] new background colour, if the renderer has one; None: as before.
 
         Returns:
@@ -183,7 +183,7 @@ class BakedRenderer:
         return graph
 
     def complete(self) -> bool:
-        """Wait for the latest frame; return True if the working memory was large enough for it."""
+        """Wait for the latest frame; return True if the working memory had room for its pairs."""
         return self._surfels == 0 or self.workspace.counts()[1] <= self.workspace.capacity
 
     def _draw(self, stages: Stage) -> None:

@@ -26,9 +26,8 @@ IMAGES: dict[str, tuple[int, torch.dtype]] = {
 
 
 class DrawCache:
-    """Data of a scene kept between frames: the atlas in device form, and working memory.
-
-    Thread-safe, as nerfstudio's viewer renders from several threads."""
+    """Data of a scene kept between frames: the atlas in device form, and working memory. Thread-safe, as nerfstudio's
+    viewer renders from several threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()

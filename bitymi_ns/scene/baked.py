@@ -17,7 +17,7 @@ from .camera import Camera
 from .sampling import TWO_SAMPLES, Sampling, averaged, padded, part_of, sampling_of, size_of
 
 FAST = 1 / 512  # transmittance at which fast rendering ends a pixel: at most half an 8-bit step is lost
-OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")  # fields of a `BakedOutput`
+OUTPUTS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")  # of a `BakedOutput`
 
 
 def as_bytes(image: Tensor) -> Tensor:
@@ -26,25 +26,25 @@ def as_bytes(image: Tensor) -> Tensor:
 
 
 def image_names(maps: bool) -> tuple[str, ...]:
-    """List the images, names of `ops.baked.IMAGES`, to render for a `BakedOutput`."""
+    """List the images to render for a `BakedOutput`."""
     return OUTPUTS if maps else OUTPUTS[:2]
 
 
 @dataclass
 class BakedOutput:
-    """A rendered view of a baked scene; fields as in `scene.RenderOutput`."""
+    """A rendered view of a baked scene; fields as in `scene.RenderOutput`, the last four with `maps`."""
 
     rgb: Tensor
     alpha: Tensor
-    beta: Tensor | None
-    depth: Tensor | None
-    normal: Tensor | None
-    overdraw: Tensor | None
+    beta: Tensor | None = None
+    depth: Tensor | None = None
+    normal: Tensor | None = None
+    overdraw: Tensor | None = None
 
 
 @dataclass
 class BakedScene:
-    """A baked scene and its renderer, on the CPU or a CUDA device; result of the bake and content of a bundle.
+    """A baked scene, content of a bundle, and its renderer on the CPU or a CUDA device.
 
     Attributes:
         surfels: per-surfel parameters by name (docs/overview.md), float32.
@@ -56,16 +56,16 @@ class BakedScene:
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
         extent: [N] half side of the tile in scale units; None: 3 everywhere, the kernel's support.
         mean_residual: [N, 3] float32 mean residual of each tile, and the residual of surfels without a tile. None: 0.
-        alpha_scale: texels multiply their surfel's sigma by m = alpha_scale * value of their fourth channel, see
-            `ops.TexelAlpha`; 0: opaque texels.
+        alpha_scale: texels multiply their surfel's sigma by m = alpha_scale * value of their fourth channel
+            (`ops.TexelAlpha`); 0: opaque texels.
         mean_alpha: [N] float32 mean m of each tile, and m of surfels without a tile. None: 1.
         near: near plane, camera z.
         weight_bound: fragments of smaller blending weight have no residual.
         transmittance_min: a pixel ends at the surfel, not blended itself, that would leave less transmittance; 0: no
             limit. Training uses 1e-4, and WebGPU always.
         photographed: [P, 4] float32 on the CPU, points of the scene and their resolution in the photographs, pixels per
-            world unit, to choose the sampling of a view (`sampling.py`); None: as at the photographs' scale.
-        through_webgpu: render through WebGPU (`ops.webgpu`) on any device; images are then on the CPU.
+            world unit, for the sampling of a view (`sampling.py`); None: as at the photographs' scale.
+        through_webgpu: render through WebGPU (`ops.webgpu`), to the CPU.
     """
 
     surfels: Mapping[str, Tensor]
@@ -106,7 +106,7 @@ class BakedScene:
         return values / 255.0 if self.atlas.dtype == torch.uint8 else values
 
     def to(self, device: torch.device | str) -> BakedScene:
-        """Move the surfels to a device; texels are uploaded as textures at the first render."""
+        """Move the surfels to a device; the first render uploads the texels."""
         return self._changed(lambda name, value: value.to(device))
 
     def only(self, kept: Tensor) -> BakedScene:
@@ -114,7 +114,7 @@ class BakedScene:
         return self._changed(lambda name, value: value if name == "view_terms" else value[kept.to(value.device)])
 
     def _changed(self, change: Callable[[str, Tensor], Tensor]) -> BakedScene:
-        """Change the arrays of the surfels, given their names."""
+        """Change the surfels' arrays, given their names."""
         surfels = {name: change(name, value) for name, value in self.surfels.items()}
         arrays = {name: getattr(self, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
         arrays = {name: change(name, value) for name, value in arrays.items() if value is not None}
@@ -138,17 +138,16 @@ class BakedScene:
         Raises:
             ValueError: the scene is on the CPU and has only the atlas's BC7 blocks.
         """
-        images = {name: image[0] for name, image in self._draw([camera], background, image_names(maps)).items()}
-        return BakedOutput(images["rgb"], images["alpha"], *map(images.get, OUTPUTS[2:]))
+        images = self._draw([camera], background, image_names(maps))
+        return BakedOutput(**{name: image[0] for name, image in images.items()})
 
     @torch.no_grad()
     def render_views(
         self, cameras: Sequence[Camera], background: Tensor | None = None, images: Sequence[str] = ("rgb", "alpha")
     ) -> dict[str, Tensor]:
-        """Render a batch of views of one size on a CUDA device, with the same samples per pixel.
+        """Render at least one view, all of one size, in a batch on a CUDA device, with the same samples per pixel.
 
         Args:
-            cameras: at least one.
             background: [3] colour behind the scene; None: black.
             images: names of `ops.baked.IMAGES`.
 
@@ -160,13 +159,11 @@ class BakedScene:
             RuntimeError: the scene is on the CPU; or the device has too little memory.
         """
         if not cuda_backend(self.tiles.device):
-            raise RuntimeError(
-                "views are drawn together on a CUDA device only: move the scene there, or render one by one"
-            )
+            raise RuntimeError("only a CUDA device draws views together: move the scene there, or render one by one")
         return self._draw(cameras, background, images)
 
     def sampling(self, cameras: Sequence[Camera]) -> Sampling:
-        """Choose the sampling of a batch of views, by the geometric mean of their scales."""
+        """Choose the sampling of views by the geometric mean of their scales."""
         if self.photographed is None or not len(self.photographed):
             return Sampling()
         size = math.exp(sum(math.log(size_of(self.photographed, camera)) for camera in cameras) / len(cameras))
@@ -177,7 +174,7 @@ class BakedScene:
         return replace(sampling_of(size, (right - left) * (bottom - top)), part=part)
 
     def _draw(self, cameras: Sequence[Camera], background: Tensor | None, images: Sequence[str]) -> dict[str, Tensor]:
-        """Render with `ops.baked.draw`, at the sampling of the views."""
+        """Render at the sampling of the views."""
         common_size(cameras)
         sampling = self.sampling(cameras)
         if sampling.samples == 1:

@@ -17,8 +17,7 @@ class Camera:
     Attributes:
         viewmat: [4, 4] float32, world to camera.
         K: [3, 3] float32, intrinsics in pixels; pixel (i, j) is sampled at (i + 0.5, j + 0.5).
-        width: image width in pixels.
-        height: image height in pixels.
+        width, height: image size in pixels.
     """
 
     viewmat: Tensor
@@ -43,7 +42,7 @@ class Camera:
 
     @property
     def center(self) -> Tensor:
-        """Camera centre in the world frame, [3], in the dtype of `viewmat`."""
+        """`exact_center` in the dtype of `viewmat`."""
         return self.exact_center.to(self.viewmat)
 
     @cached_property
@@ -65,7 +64,7 @@ class Camera:
         return self._with(viewmat=viewmat, K=K)
 
     def posed(self, viewmat: Tensor) -> Camera:
-        """Replace the pose by another world-to-camera matrix [4, 4], converted to this camera's dtype and device."""
+        """Replace the pose by another world-to-camera matrix [4, 4] of any dtype and device."""
         return self._with(viewmat=viewmat.to(self.viewmat))
 
     def local(self, points: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ def _current(cached: tuple[Tensor, int, T] | None, buffer: Tensor) -> T | None:
 class HashField(nn.Module):
     """Multiresolution hash grid and MLP: view-independent residual colour rho(x), eq. (color).
 
-    The last layer is initialised with 0, and so the residual is 0; table entries with U(-1e-4, 1e-4).
+    The last layer, and so the residual, is initially 0; table entries are U(-1e-4, 1e-4).
 
     Args:
         mid: centre of the domain, world.
@@ -111,7 +111,7 @@ class TexelField(nn.Module):
     """
 
     STEADY: ClassVar = ("size", "extent", "share")
-    """Buffers that training replaces but never modifies in place, so that copies of the scene may share them."""
+    """Buffers that training never modifies in place, so that copies of the scene may share them."""
 
     size: Tensor
     extent: Tensor
@@ -152,7 +152,7 @@ class TexelField(nn.Module):
 
     @torch.no_grad()
     def keep(self, rows: Tensor) -> None:
-        """Keep only the surfels `rows` [n] int64, in that order."""
+        """Keep the surfels `rows` [n] int64, in that order."""
         old = self.tiles.rows_of(rows)
         self.texels = nn.Parameter(self.texels.detach()[old])
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])

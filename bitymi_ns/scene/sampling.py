@@ -12,9 +12,9 @@ from bitymi_ns.ops.constants import SUPPORT
 from .camera import Camera
 
 AS_TRAINED = (0.75, 1.5)
-"""Scales between which views are rendered as in training: photographs, too, show the scene from near and far."""
+"""Scales between which views are rendered as in training."""
 SMALLEST, LARGEST = 0.5, 2.0
-"""Scales beyond which the pixel footprint follows the view's scale; it is interpolated in between."""
+"""Scales beyond which the pixel footprint follows the view's scale."""
 ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
 """Smallest scales with one sample per pixel, and with two along each axis."""
 SAMPLE = 0.58

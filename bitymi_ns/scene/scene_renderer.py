@@ -7,7 +7,7 @@ from torch import Tensor
 
 from bitymi_ns.ops.backend import cuda_backend
 from bitymi_ns.ops.baked_renderer import BakedRenderer
-from .baked import OUTPUTS, BakedOutput, BakedScene, image_names
+from .baked import BakedOutput, BakedScene, image_names
 from .camera import Camera
 from .sampling import Sampling
 
@@ -23,7 +23,7 @@ class SceneRenderer:
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type, tuple[BakedScene, int]]:
-        """Pickle scene and settings only: working memory and graphs belong to one process."""
+        """Pickle without working memory and graphs, which belong to one process."""
         return SceneRenderer, (self.scene, self._kept)
 
     @torch.no_grad()
@@ -44,5 +44,4 @@ class SceneRenderer:
                 names, graph = image_names(maps), device.type == "cuda"
                 self._renderers[key] = BakedRenderer(scene, *key[:2], 1, names, background, graph)
             images = self._renderers[key].draw([camera], background=background)
-            copies = {name: image[0].clone() for name, image in images.items()}
-            return BakedOutput(copies["rgb"], copies["alpha"], *map(copies.get, OUTPUTS[2:]))
+            return BakedOutput(**{name: image[0].clone() for name, image in images.items()})

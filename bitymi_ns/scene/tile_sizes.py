@@ -27,8 +27,7 @@ def voxel_along_axes(voxel: Tensor, axes: Tensor, means: Tensor, center: Tensor 
 
     Outside the unit ball of a contracted scene, voxels are elongated along the ray from the centre. With cos the
     component of an axis along that ray, a unit step crosses cos / radial voxels along the ray and sin / tangential
-    ones across it; the edge is 1 over the root of the sum of their squares. Without a centre both axes use the smaller
-    edge.
+    ones across it; the edge is 1 over the root of the sum of their squares. Without a centre it is the smaller edge.
 
     Args:
         voxel: [N, 2] (radial, tangential) voxel edges at the surfels' centres, world units.
@@ -105,9 +104,8 @@ def max_projected_extent(
     """Compute the largest projected size of each surfel's tile over the views, per tangent axis: [N, 2] pixels, 0 if no
     view counts.
 
-    The segment from -e s_a to +e s_a along axis a is projected with the Jacobian of the pinhole at the surfel's
-    centre. A view counts if the centre lies beyond the near plane and within the image enlarged by the projected half
-    extents.
+    The segment from -e s_a to +e s_a along axis a is projected with the pinhole's Jacobian at the surfel's centre. A
+    view counts if the centre lies beyond the near plane and within the image enlarged by the projected half extents.
 
     Args:
         means, scales: [N, 3] positions and [N, 2] tangent scales, world units.

@@ -45,7 +45,7 @@ class Visibility:
 
     @property
     def in_front(self) -> Tensor:
-        """Transmittance [N], but 1 for surfels that no view blends, for which it is unknown."""
+        """Transmittance [N], but 1 for surfels that no view blends."""
         return torch.where(self.transmittance > 0, self.transmittance, 1.0)
 
     def of(self, rows: Tensor) -> Visibility:

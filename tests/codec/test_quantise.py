@@ -99,10 +99,12 @@ def test_bc7_keeps_a_smooth_atlas_close(profile):
     assert profile in encoded.encoder
 
 
-def test_bc7_does_not_depend_on_threads_and_beats_noise(atlas):
+def test_bc7_does_not_depend_on_threads_and_beats_noise(atlas, monkeypatch):
     packing, texels = atlas
-    one = encode(texels, packing, "bc7", threads=1)
-    assert one.payload == encode(texels, packing, "bc7", threads=3).payload
+    monkeypatch.setattr("os.cpu_count", lambda: 1)
+    one = encode(texels, packing, "bc7")
+    monkeypatch.setattr("os.cpu_count", lambda: 3)
+    assert one.payload == encode(texels, packing, "bc7").payload
     assert len(one.payload) == packing.layers
     assert one.psnr > 38
     assert one.nbytes * 4 == encode(texels, packing, "uint8").nbytes

@@ -134,16 +134,3 @@ def test_damage_past_the_hashes(whole: tuple[dict[str, Any], dict[str, bytes]]) 
         tracemalloc.stop()
     print(f"{EXAMPLES} damaged bundles: {found} opened, {EXAMPLES - found} refused")
     assert 0.05 * EXAMPLES < found < 0.95 * EXAMPLES
-
-
-def test_a_bomb_is_refused_by_its_size_alone(whole: tuple[dict[str, Any], dict[str, bytes]]) -> None:
-    info, files = json.loads(json.dumps(whole[0])), dict(whole[1])
-    column = info["surfels"]["columns"][0]
-    bomb = compress(np.zeros((1 << 20, 1), dtype=np.int64)).data  # as many rows as are asked for: no byte per row
-    files[COMPACT_SURFELS] = bomb + files[COMPACT_SURFELS][sum(column["bytes"]) :]
-    column["bytes"] = [len(bomb)]
-    info["surfels"]["count"] = 1 << 30
-    tracemalloc.start()
-    assert not opened(info, files)
-    assert tracemalloc.get_traced_memory()[1] < MEMORY
-    tracemalloc.stop()

@@ -52,25 +52,24 @@ def load_capture(
 ) -> tuple[list[View], Tensor, Tensor]:
     """Load a capture of any format that `ns-train` reads: photographs with cameras and masks, and points.
 
-    Photographs are undistorted; those of wide cameras become several views. All stay in memory as bytes. Poses, scale
-    and axes of the world are those of the capture's files, but a COLMAP model's are turned so that up, about -y, is z.
-    Cameras and points are float32: translate captures with large coordinates (UTM, for example) to the origin first.
+    Photographs are undistorted; those of wide cameras become several views. All stay in memory. Poses, scale and axes
+    are those of the capture's files, but a COLMAP model's are turned so that up, about -y, is z. Cameras and points are
+    float32: translate captures with large coordinates (UTM) to the origin first.
 
     Args:
         path: a folder, or a file: transforms.json or a video.
-        part: photographs to load: all in the order of their names, or a part of the capture's own split; where it has
-            none, every eighth is "val" and "test".
-        options: fields of `capture.read.CaptureOptions`, as `downscale_factor=2` or `points="random"` (no points).
+        part: photographs to load: all by name, or a part of the capture's own split; without one, every eighth is "val"
+            and "test".
+        options: fields of `capture.read.CaptureOptions`, as `downscale_factor=2` or `points="random"` (none).
 
     Returns:
         views: `Camera`s are world to camera with OpenCV axes (x right, y down, z forward), in pixels; images uint8
             [H, W, 3], or [H, W, 4] with straight alpha; masks [H, W] bool or None.
-        points: [M, 3] of the capture, triangulated (and kept beside the photographs) where it has none; M may be 0.
+        points: [M, 3] of the capture, triangulated where it has none; M may be 0.
         colors: [M, 3] in [0, 1].
 
     Raises:
-        CaptureError: a ValueError; the capture cannot be used, or an option is out of range. Names the file and the
-            entry, and says what to do.
+        CaptureError, a ValueError: the capture cannot be used, or an option is out of range.
         TypeError, KeyError: there is no such option, or part.
     """
     asked = CaptureOptions(data=Path(path), **options)
@@ -117,12 +116,12 @@ def rasterize(
 
     Args:
         means: [N, 3] centers, world frame.
-        quats: [N, 4] rotations, wxyz, not necessarily normalised; the first two columns of the matrix are the tangents.
+        quats: [N, 4] rotations, wxyz, of any length; the first two columns of the matrix are the tangents.
         scales: [N, 2] > 0, lengths of the two tangents, world units; the disc ends at three times its scales.
         opacities: [N] from 0 to 1.
         betas: [N] from 0 to 4, exponent of the kernel: small = hard disc, 3.5 = nearly Gaussian.
         colors: [N, 3] in the images' own scale, clamped at 0.
-        camera: in OpenCV axes. The gradient of its `viewmat` is projected onto rigid motions.
+        camera: its `viewmat` has a gradient projected onto rigid motions.
         background: [3] color behind the surfels; None: black.
         near: surfels with a nearer center are not drawn (camera z, world units).
         maps: also render depth and normals.
@@ -133,9 +132,8 @@ def rasterize(
         [H, W, 3], both summed with the blending weights, in the camera frame.
 
     Raises:
-        ValueError: a shape, dtype or device does not fit, a scale, opacity or beta is out of its range, or the camera
-            has skew.
-        TooManyFragments: those of a single row of screen tiles do not fit into memory; a larger view is drawn in bands.
+        ValueError: a shape, dtype or device does not fit, a value is out of its range, or the camera has skew.
+        TooManyFragments: those of a row of screen tiles do not fit into memory; larger views are drawn in bands.
         MemoryError: the picture does not fit.
     """
     on_same_device(means, scales=scales, opacities=opacities, betas=betas)
@@ -162,7 +160,7 @@ def rasterize(
 
 def _check_ranges(**ranges: tuple[Tensor, float, float]) -> None:
     wrong = {name: ~((values >= low) & (values <= high)) for name, (values, low, high) in ranges.items()}
-    if not torch.stack([each.any() for each in wrong.values()]).any():  # waits for the device once
+    if not torch.stack([each.any() for each in wrong.values()]).any():  # one wait for the device
         return
     name = next(name for name, each in wrong.items() if each.any())
     (values, low, high), row = ranges[name], tuple(wrong[name].nonzero()[0].tolist())
@@ -171,9 +169,8 @@ def _check_ranges(**ranges: tuple[Tensor, float, float]) -> None:
 
 
 def _logit(p: Tensor) -> Tensor:
-    """Compute logits, clamped to finite values with a straight-through gradient. The operations take logits, like those
-    of training, and apply the sigmoid: its slope o (1 - o) is exact as a function of the logit, but in float32 nothing
-    is left of 1 - o where o -> 1."""
+    """Compute logits, clamped to finite values with a straight-through gradient. The operations apply the sigmoid, as
+    its slope o (1 - o) is exact as a function of the logit, but in float32 nothing is left of 1 - o where o -> 1."""
     nearest = p.clamp(1e-12, 1.0 - 8 * torch.finfo(p.dtype).eps)
     return torch.logit(p + (nearest - p).detach())
 
@@ -196,24 +193,24 @@ def train_scene(
 
     Args:
         views: photographs with their cameras, at full size.
-        points: [M, 3] world positions of the initial surfels, e.g. a sparse point cloud; M may be 0. A short run uses a
-            random subset (`TrainConfig.first_surfels`).
+        points: [M, 3] world positions of the initial surfels; M may be 0. A short run uses a random subset
+            (`TrainConfig.first_surfels`).
         colors: [M, 3] in [0, 1], of the points.
         steps: length of the run; all schedules scale with it.
         method: preset, the name of a file in method_configs/.
         eval_views: held-out photographs, whose PSNR is logged.
         seed: of all random numbers.
-        refine_poses: on = optimise the cameras of the photographs together with the scene (`log.cameras`).
+        refine_poses: on = optimise the cameras, too (`log.cameras`).
         device: to train on.
-        callback: called after each step with the number of steps and the loss, which synchronises a CUDA device.
+        callback: called after each step with its number and the loss, which synchronises a CUDA device.
 
     Returns:
-        The scene on `device`, and the log with the final PSNR of `eval_views` and the cameras of `views`. If poses were
-        refined, give `bake_scene` the views with these cameras.
+        The scene on `device`, and the log with the PSNR of `eval_views` and the cameras of `views`: if poses were
+        refined, give `bake_scene` the views with these.
 
     Raises:
-        ValueError: there are no views, their masks exclude everything, a view, points or colors are not as stated (the
-            view's index is named), an option is out of range, or torch is in inference mode.
+        ValueError: there are no views, their masks exclude everything, a view, points or colors are not as stated, an
+            option is out of range, or torch is in inference mode.
         PresetError: there is no such preset.
     """
     views, eval_views = checked_views(views), checked_views(eval_views, "eval_views")
@@ -246,8 +243,7 @@ def bake_scene(
         folder: of the bundle, complete or absent.
         background: [3] color behind the scene; None: black.
         overwrite: replace an existing bundle.
-        options: format of the bundle (compact, bc7, uint8 or fp16), tolerance, tiles and others, see `BakeOptions`;
-            None: its defaults, a compact bundle.
+        options: see `BakeOptions`; None: its defaults, a compact bundle.
         target_mb: limit of all files of a compact bundle, in MB (10^6 bytes); None: the default precision.
 
     Returns:
@@ -255,8 +251,7 @@ def bake_scene(
 
     Raises:
         ValueError: as `train_scene`; no surfel is left, or the atlas would be too large.
-        BundleError: the folder exists or cannot be written, which is tried first, or what was written cannot be read;
-            an earlier bundle then stays.
+        BundleError: the folder exists or cannot be written, which is tried first, or what was written cannot be read.
         RuntimeError: the format is bc7, and its encoder is not installed.
     """
     views = checked_views(views)

@@ -23,7 +23,7 @@ def say(text: object, to: TextIO | None = None) -> None:
     print(printable(str(text)), file=to or sys.stdout, flush=True)
 
 
-# a flag without its --no- form, if this version of tyro supports it
+# without the --no- form, if tyro supports it
 Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairsOff") else bool
 
 
@@ -31,11 +31,11 @@ Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairs
 class Sample:
     """Ray-trace a small room and write it as a nerfstudio capture: images, exact cameras and sparse points."""
 
-    output_dir: Path  # Folder to write; it must not hold anything yet.
+    output_dir: Path  # Folder to write, empty.
     views: int = 60  # Number of images.
     width: int = 320  # Image width in pixels.
     height: int = 240  # Image height in pixels.
-    seed: int = 0  # Chooses textures, camera path and points; equal seeds give equal captures.
+    seed: int = 0  # Of textures, camera path and points.
     points: int = 8000  # Number of sparse points.
     overwrite: Flag = False  # Replace the folder if it holds something.
 
@@ -52,7 +52,7 @@ class Sample:
 class Sfm:
     """Find the camera poses of photographs or of a video; write a COLMAP model and a nerfstudio capture."""
 
-    source: tyro.conf.Positional[Path]  # Folder of photographs (or with `images`, and `masks`, in it), or a video.
+    source: tyro.conf.Positional[Path]  # Folder of photographs (or of `images` and `masks`), or a video.
     output: Path | None = None
     """Folder to write the capture to; none = keep the poses beside the photographs, and print their folder."""
     options: tyro.conf.OmitArgPrefixes[SfmOptions] = SfmOptions()
@@ -87,7 +87,7 @@ class Report:
 
     inputs: tyro.conf.Positional[tuple[Path, ...]]
     """JSON files of ns-eval, cells of `bitymi bench`, training curves, images, and folders with these."""
-    output_dir: Path = Path("report")  # Folder to write the page to.
+    output_dir: Path = Path("report")  # Folder of the page.
     title: str = "bitymi report"  # Heading of the page.
 
     def run(self) -> None:
@@ -100,7 +100,7 @@ class Report:
 class Stability:
     """Measure float32 errors on extreme scenes and write a page with a plot beside it."""
 
-    output: Path = Path("stability.md")  # Markdown file to write; the plot gets its name with .png.
+    output: Path = Path("stability.md")  # Markdown file; the plot is beside it, as .png.
     backend: Literal["cpu", "cuda", "emulated"] = "cpu"  # Kernels to measure.
 
     def run(self) -> None:
@@ -144,7 +144,7 @@ class Verify:
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file (bitymi pack).
     run_config: Annotated[Path | None, tyro.conf.arg(name="run")] = None
     """config.yml, folder or checkpoint of the run: also compare the bundle's residuals and renders with the run's."""
-    views: int | None = None  # Held-out views of the run to render; not given: 4.
+    views: int | None = None  # Held-out views to render; not given: 4.
 
     def run(self) -> int:
         from rich.console import Console
@@ -187,7 +187,7 @@ class Pack:
     """Write a bundle as one file, its parts in the order of their use; all commands read it like the folder."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
-    output: Path | None = None  # File to write; not given: beside the folder, with its name and .bitymi.
+    output: Path | None = None  # File to write; not given: NAME.bitymi beside the folder.
     overwrite: Flag = False  # Replace an existing single-file bundle.
 
     def run(self) -> None:
@@ -210,13 +210,14 @@ class Pack:
 class Unpack:
     """Write a single-file bundle as a folder, with a config.yml for nerfstudio's commands."""
 
-    bundle: tyro.conf.Positional[Path]  # The one file, or the folder of a bundle that has no config.yml.
-    output: Path | None = None  # Folder to write; not given: beside the file, with its name without .bitymi.
+    bundle: tyro.conf.Positional[Path]  # The one file, or a folder without config.yml.
+    output: Path | None = None  # Folder to write; not given: beside the file, without .bitymi.
 
     def run(self) -> None:
+        from .bundle.parts import CONFIG
         from .bundle.read import read_manifest
         from .bundle.single import SUFFIX, write_folder
-        from .plugin.export.target import CONFIG, config_without_run
+        from .plugin.export.target import config_without_run
 
         folder = self.output or self.bundle.with_name(self.bundle.name.removesuffix(SUFFIX))
         config = config_without_run(folder, read_manifest(self.bundle))
@@ -235,7 +236,7 @@ class Extras:
     surfels.usdc, OpenUSD's surflets; mesh: mesh.glb, a textured quad per surfel."""
     frame: Literal["scene", "capture"] = "scene"  # Frame of the files: the scene's, or the capture's.
     crop: Flag = False  # Leave out the surfels that notes.json hides.
-    output: Path | None = None  # Folder to write; not given: beside the bundle, with its name and .extras.
+    output: Path | None = None  # Folder to write; not given: NAME.extras beside the bundle.
     overwrite: Flag = False  # Replace an existing folder of extras.
 
     def run(self) -> None:
@@ -264,8 +265,8 @@ class View:
     """Show a bundle in the browser, or export it with its page to a folder for any web server."""
 
     bundle: tyro.conf.Positional[Path]  # Folder of the bundle, or its one file.
-    export: Path | None = None  # Folder to write the page and the bundle to; none = show it now.
-    one_file: Flag = False  # With --export: write the bundle as one file, which the page reads by range requests.
+    export: Path | None = None  # Folder to write page and bundle to; none = show it now.
+    one_file: Flag = False  # With --export: the bundle as one file, read by range requests.
     overwrite: Flag = False  # Replace an exported page.
     host: str = "127.0.0.1"
     """Address to listen on. On one other than loopback, everyone who can reach this machine sees the bundle."""
@@ -330,7 +331,7 @@ def main(args: Sequence[str] | None = None) -> int:
     )
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # for terminals whose encoding lacks a character
+            stream.reconfigure(errors="backslashreplace")  # for terminals that lack a character
     try:
         return command.run() or 0
     except BrokenPipeError:

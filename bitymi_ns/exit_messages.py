@@ -63,7 +63,7 @@ def line_of(error: BaseException) -> str | None:
 
 def end_as_by_ctrl_c() -> list[signal.Signals]:
     """Have the signals of batch systems and of terminals that are gone raise KeyboardInterrupt, unless they are handled
-    or ignored. Return those that have changed."""
+    or ignored. Return those that changed."""
     if threading.current_thread() is not threading.main_thread():
         return []
     changed = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
@@ -88,7 +88,7 @@ def run(command: Callable[[], int]) -> int:
             sys.stdout.flush()
     except BrokenPipeError:
         with suppress(OSError, ValueError):  # stdout may be no file
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes again at exit
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return NO_READER
     except (KeyboardInterrupt, Exception) as error:
         line = line_of(error)
@@ -137,7 +137,7 @@ def install(then: Callable[[], str] = str) -> None:
     ran out, beside the usual."""
     global _then
     _then, before = then, sys.excepthook
-    atexit.register(_end_by_default, end_as_by_ctrl_c())  # the interpreter prints exceptions of its own shutdown
+    atexit.register(_end_by_default, end_as_by_ctrl_c())  # exceptions of the shutdown are printed
 
     def handle(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
         line = line_of(error)

@@ -103,11 +103,11 @@ def parents_of(path: Path) -> Iterator[None]:
 @contextmanager
 def reserved(target: str | Path, check: Callable[[], None] | None = None, tell: Tell = warnings.warn) -> Iterator[Path]:
     """Lock the path of a file or folder, and repair the remains of a killed process there; yield it with links
-    resolved. Missing parents are created, and removed if they remain empty. Reservations of one thread may be nested.
+    resolved. Missing parents are created, and removed if they remain empty. One thread may nest reservations.
 
     `check`: for a folder: raises if the existing one may not be replaced; None: the target is a file. `tell`: called if
     the file system has no locks. Raises Busy: another process is writing it; OSError: nothing can be written there, or
-    it is a folder instead of a file, or a file or a link to nothing instead of a folder; `reason` says why."""
+    it is a folder instead of a file, or the reverse; `reason` says why."""
     place = Path(os.path.realpath(target))
     kind = errno.EBUSY if os.path.ismount(place) else 0
     if not kind and os.path.lexists(target) and place.is_dir() != (check is not None):
@@ -137,7 +137,7 @@ def _check_movable(place: Path) -> None:
         try:
             os.close(os.open(place, os.O_WRONLY | os.O_NONBLOCK))
         except OSError as error:
-            if error.errno == errno.EPERM:  # other errors do not prevent that it is replaced
+            if error.errno == errno.EPERM:  # others do not prevent it
                 raise
         return
     new, _ = _temporary_paths(place)
@@ -181,7 +181,7 @@ def _recover(place: Path) -> None:
     _remove(new)
     if is_left(old):
         if place.exists():
-            old.rename(new)  # so that an .old is always complete, even if killed during removal
+            old.rename(new)  # an .old is always complete
             _remove(new)
         else:
             old.rename(place)
@@ -198,9 +198,9 @@ def complete_folder(
 ) -> Iterator[Path]:
     """Create a temporary folder, which is yielded, and replaces the target if the block ends without an exception.
 
-    After an exception the target is unchanged. After a kill it is the old or the new folder, or both are beside it
-    until the next writer repairs that. `check`: raises if the existing target may not be replaced; called before and
-    after the block. Raises as `reserved`."""
+    Else the target is unchanged. After a kill it is the old or the new folder, or both are beside it until the next
+    writer repairs that. `check`: raises if the existing target may not be replaced; called before and after the block.
+    Raises as `reserved`."""
     with reserved(target, check, tell) as place:
         new, old = _temporary_paths(place)
         try:
@@ -224,7 +224,7 @@ def complete_file(path: Path, scratch: Path | None = None, follow: bool = False)
     """Open a temporary file that replaces `path` if the block ends without an exception. `follow`: write through a
     link, for a path that the user gave; False: replace the link, for files of a folder that may come from others.
     `scratch`: folder on the same file system for the unfinished file; None: that of `path`. Raises Busy: another
-    process is writing it; OSError: it cannot be written; `reason` says why."""
+    process is writing it; OSError: it cannot be written."""
     path = Path(os.path.realpath(path)) if follow else path
     unfinished = (scratch or path.parent) / f".{path.name}{UNFINISHED}"
     with parents_of(path):

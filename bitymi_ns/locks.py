@@ -15,7 +15,7 @@ from typing import BinaryIO
 
 from .trust import no_links
 
-Tell = Callable[[str], None]  # receives a warning for the user
+Tell = Callable[[str], None]
 
 
 class Busy(BlockingIOError):
@@ -45,7 +45,7 @@ def open_locked(path: Path) -> tuple[BinaryIO, bool]:
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(file.fileno()), os.lstat(path)):
                 return file, True
-        file.close()  # the previous holder has removed or renamed it in the meantime
+        file.close()  # removed or renamed meanwhile
 
 
 class Lock:
@@ -53,8 +53,8 @@ class Lock:
     process does not block."""
 
     def __init__(self, path: Path, tell: Tell = warnings.warn) -> None:
-        """Lock the file `path`, whose folder must exist. `tell`: called if the file system has no locks; the lock is
-        then ineffective. Raises Busy: another process holds it; OSError: the file cannot be created."""
+        """Lock the file `path`, whose folder must exist. `tell`: called if the file system has no locks. Raises Busy:
+        another process holds it; OSError: the file cannot be created."""
         self.path, self._owner = path, os.getpid()
         try:
             self._file, locked = open_locked(path)
@@ -101,7 +101,7 @@ def _holder(path: Path) -> str:
     return f"process {process}{where} is writing there: wait for it, or end it (kill {process})"
 
 
-held: dict[tuple[str, int], Lock] = {}  # locks by file and thread, to make them reentrant
+held: dict[tuple[str, int], Lock] = {}  # by file and thread, to make them reentrant
 
 
 def hold(path: Path, tell: Tell = warnings.warn) -> None:

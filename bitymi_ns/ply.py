@@ -39,7 +39,7 @@ class PlyError(ValueError):
 class Element:
     count: int  # of rows
     names: tuple[str, ...]  # of properties
-    row: np.dtype | None  # dtype of a row, a field per property; None if a property is a list
+    row: np.dtype | None  # a field per property; None if one is a list
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def write_cloud(path: Path, points: npt.NDArray, colors: npt.NDArray) -> None:
 
 def header_of(data: bytes | bytearray, size: int) -> Header:
     """Parse the header in the first `HEADER_LIMIT` bytes of a bundle's file of `size` bytes. Raises PlyError: not
-    binary little-endian, `vertex` is not first, a property is not float or int, or the size does not match."""
+    binary little-endian, `vertex` is not first, a property is not float or int, or the size differs."""
     header = parse_header(data)
     if header.order != "<":
         raise PlyError("not a binary little-endian PLY file of version 1.0")

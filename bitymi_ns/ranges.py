@@ -48,8 +48,7 @@ def short(value: Any) -> str:
 
 
 def check_ranges(options: Any) -> None:
-    """Check that options are within their ranges. Raises ValueError: one is not; the message has the option, its range
-    and the value."""
+    """Check that options are within their ranges. Raises ValueError with the option, its range and the value."""
     try:
         TypeAdapter(type(options)).validate_python(asdict(options))
     except ValidationError as error:

@@ -80,4 +80,4 @@ _captures.addHandler(_Console())
 _captures.setLevel(logging.INFO)
 _captures.propagate = False
 
-warn_once = functools.cache(warn)  # each message once in a process
+warn_once = functools.cache(warn)

@@ -43,7 +43,7 @@ REFUSED = {
 """Classes of nerfstudio's exporter that cannot work on surfels: their commands, and why."""
 COMMAND, MESH_COMMAND = "bitymi-atlas", "bitymi-mesh"
 EXPORTER, VIEWER = "nerfstudio.scripts.exporter", "nerfstudio.scripts.viewer.run_viewer"
-LOOPBACK = "127.0.0.1"  # reachable from this machine alone, unlike nerfstudio's default 0.0.0.0
+LOOPBACK = "127.0.0.1"  # reachable from this machine alone
 HOST_OPTION = "--viewer.websocket-host"
 
 
@@ -148,7 +148,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
         config.read_from = evaluated
         datamanager = config.pipeline.datamanager
         data = datamanager.data or getattr(datamanager.dataparser, "data", None)
-        if data is not None and not Path(data).exists() and has_cameras(model.bundle):  # its capture is gone
+        if data is not None and not Path(data).exists() and has_cameras(model.bundle):
             gray = render.leave_out_photographs(command)
             datamanager.dataparser = BundleCamerasConfig(data=model.bundle, capture=Path(data), gray=gray)
             datamanager.data = model.bundle
@@ -161,7 +161,7 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     if evaluated is not None:
         if (evaluated / config.relative_model_dir).is_dir():
             folder, config.read_from = evaluated / config.relative_model_dir, evaluated
-        # a resumed run records the step that it went on from
+        # a resumed run records the step it went on from
         if config.load_step is None or not checkpoints.path_of(folder, config.load_step).is_file():
             config.load_step = checkpoints.newest_step(folder)
         path = checkpoints.path_of(folder, config.load_step)
@@ -320,7 +320,7 @@ def patch_render() -> None:
     )
     names = (*ours, "VanillaDataManager")
     stock = getattr(script["_render_trajectory_video"], "stock", {name: script[name] for name in names})
-    ours["VanillaDataManager"] = (stock["VanillaDataManager"], BitymiDataManager)  # those that a spiral is allowed for
+    ours["VanillaDataManager"] = (stock["VanillaDataManager"], BitymiDataManager)  # a spiral is allowed for these
     vars(render_trajectory)["stock"] = stock
     script.update(ours)
 
@@ -335,7 +335,7 @@ def print_brackets() -> Iterator[None]:
     stock = {name: getattr(CONSOLE, name) for name in ("print", "log")}
 
     def write(name: str, *said: Any, **options: Any) -> None:
-        options |= {"_stack_offset": 2} if name == "log" else {}  # it states its caller
+        options |= {"_stack_offset": 2} if name == "log" else {}
         try:
             stock[name](*said, **options)
         except MarkupError:

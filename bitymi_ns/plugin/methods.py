@@ -44,7 +44,7 @@ def _install() -> None:
     except Exception as error:  # noqa: BLE001 - see the module's docstring
         _warn("`ns-export bitymi-atlas` is not available", error)
         return
-    CONSOLE.quiet = CONSOLE.quiet or not torchrun.own().first  # of several processes the first prints
+    CONSOLE.quiet = CONSOLE.quiet or not torchrun.own().first
     for change, lost in (
         (hooks.read_names_of_callers, "commands start slowly"),
         (lambda: hooks.extend_exporter(_exports), "`ns-export bitymi-atlas` is not available"),

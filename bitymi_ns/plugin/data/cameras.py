@@ -10,9 +10,9 @@ from torch import Tensor
 from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
 
-MAX_OFF_AXIS = 80  # largest angle between the optical axis and the picture's middle, degrees
-USUAL_VIEW = (0.5, 150.0)  # view angles of plausible focal lengths, degrees
-POSSIBLE_VIEW = (0.01, 178.0)  # view angles of accepted focal lengths, degrees
+MAX_OFF_AXIS = 80  # largest angle from the optical axis to the picture's middle, degrees
+USUAL_VIEW = (0.5, 150.0)  # of plausible focal lengths, degrees
+POSSIBLE_VIEW = (0.01, 178.0)  # of accepted focal lengths, degrees
 
 
 def to_camera(cameras: Cameras, device: torch.device | str | None = None) -> Camera:
@@ -44,7 +44,7 @@ def to_cameras(cameras: Cameras, device: torch.device | str | None = None) -> li
 
 
 def check_cameras(cameras: Sequence[Cameras], names: Sequence[object]) -> None:
-    """Fail or warn if a pinhole camera of either split sees nothing, or its focal length does not fit its size."""
+    """Fail or warn if a pinhole camera sees nothing, or its focal length does not fit its size."""
 
     def column(name: str) -> Tensor:
         return torch.cat([getattr(split, name).flatten() for split in cameras]).double()

@@ -103,9 +103,9 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
         yield
     except ImportError as error:
         fail(f"nerfstudio's reader of this capture cannot be loaded: {error}. Install the module or library.", error)
-    except Image.DecompressionBombError as error:  # nerfstudio opens photographs before they are checked
+    except Image.DecompressionBombError as error:
         fail(f"{capture} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller", error)
-    except (CaptureError, NameError, AssertionError):  # clear already, or no fault of the capture
+    except (CaptureError, NameError, AssertionError):  # clear, or no fault of the capture
         raise
     except Exception as error:
         detail = (isinstance(error, OSError) and line_of(error)) or why(error)

@@ -36,13 +36,13 @@ from .depth import with_depth
 from .facts import KEY, CaptureFacts
 from .views import LONGEST_SIDE, limit_size, with_lenses
 
-ALPHA_SAMPLES = 8  # photographs that are searched for transparent pixels
-FEW_VIEWS = 10  # training views below which multi-view scores are unreliable
+ALPHA_SAMPLES = 8  # photographs searched for transparent pixels
+FEW_VIEWS = 10  # below, multi-view scores are unreliable
 
 if TYPE_CHECKING:
     AnyDataParser = DataParserConfig
 else:
-    # bitymi-data for these methods alone: it needs their data manager, which undistorts by lenses
+    # bitymi-data needs this data manager, which undistorts by lenses
     AnyDataParser = tyro.conf.OmitSubcommandPrefixes[
         tyro.extras.subcommand_type_from_defaults(
             {
@@ -64,7 +64,7 @@ class BitymiDataManagerConfig(FullImageDatamanagerConfig):
     longest_side: int = LONGEST_SIDE
     """Downscale photographs to this many pixels along a side as they are read; 0 = not at all."""
     train_cameras_sampling_seed: int = 42  # Seed of the order of training views.
-    # nerfstudio's options without effect here are left out of the help
+    # nerfstudio's options without effect
     train_cameras_sampling_strategy: tyro.conf.Suppress[Literal["random", "fps"]] = "random"
     fps_reset_every: tyro.conf.Suppress[int] = 100
     eval_num_images_to_sample_from: tyro.conf.Suppress[int] = -1
@@ -147,7 +147,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         points = outputs.metadata.get("points3D_xyz")
         if points is None:
             return
-        if len(points) and not len(outputs.metadata["points3D_rgb"]):  # of a parser of nerfstudio
+        if len(points) and not len(outputs.metadata["points3D_rgb"]):
             warn("The points of the capture have no colors: they start grey.")
         cameras = outputs.cameras
         centers, widths = cameras.camera_to_worlds[:, :, 3].double(), (cameras.width / cameras.fx).flatten().double()
@@ -217,9 +217,6 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         (number,) = Processes.joined().view_numbers(step)
         return training_order(len(self.train_dataset), self.config.train_cameras_sampling_seed, number)
 
-    def next_train(self, step: int) -> tuple[Cameras, dict[str, Any]]:
-        return self.train_view(self.train_index(step))
-
     @property
     def train_views(self) -> OnDemand[View]:
         """Training views at full size, read on demand, with pictures in host memory."""
@@ -230,7 +227,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return self._views(self.eval_dataset, lambda i: self.cached_eval[i])
 
     def move_cameras(self, motions: Tensor) -> Callable[[Camera], Camera] | None:
-        """Apply a run's pose corrections, motions [V, 6] of `Poses`, to the training cameras; return the function that
+        """Apply a run's pose corrections, motions [V, 6] of `Poses`, to the training cameras; return a function that
         carries other cameras along, or None if the motions are of other photographs."""
         cameras = self.train_dataset.cameras
         if len(motions) != len(cameras):
@@ -254,7 +251,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         return OnDemand(len(views), lambda i: views[i]._replace(correction=held_out[i]))
 
     def _views(self, dataset: BitymiDataset, batch: Callable[[int], dict[str, Any]]) -> OnDemand[View]:
-        cameras: dict[int, Camera] = {}  # converting one of nerfstudio's takes 1 % of a training step
+        cameras: dict[int, Camera] = {}  # converting one takes 1 % of a training step
 
         def view(index: int) -> View:
             if index not in cameras:

@@ -75,7 +75,7 @@ class BitymiDataParser(DataParser):
     def __init__(self, config: BitymiDataParserConfig, points: bool = False) -> None:
         super().__init__(config)
         self.points = points
-        self.downscale_factor: int | None = None  # set by nerfstudio if photographs are not needed: none is opened then
+        self.downscale_factor: int | None = None  # set by nerfstudio where photographs are not needed
 
     @cached_property
     @as_input_error()
@@ -102,14 +102,14 @@ class BundleCamerasConfig(DataParserConfig):
     _target: type = field(default_factory=lambda: BundleCameras)
     data: Path = Path()  # Folder of the bundle.
     capture: Path = Path()  # Folder of the lost capture.
-    gray: bool = False  # Photographs are grey; else they are refused.
+    gray: bool = False  # Photographs are grey, else refused.
 
 
 class BundleCameras(DataParser):
     """Views with a bundle's cameras and without photographs."""
 
     config: BundleCamerasConfig
-    downscale_factor = None  # nerfstudio sets it where photographs are not needed
+    downscale_factor = None  # likewise
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         folder = Path(self.config.data)

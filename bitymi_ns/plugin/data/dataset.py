@@ -27,13 +27,13 @@ from .views import MOVED, select_views
 
 PHOTOGRAPH_BYTES = 1 << 28
 """Memory for a capture's images in a run on the CPU, where a step takes far longer than reading one."""
-PREFETCH = 4  # images that are read together at the start
-RECENT = 2  # last images beyond the budget that stay cached: a step asks for a view more than once
-POSE_STEP = 1e-4  # resolution of compared poses, in units of the scene
+PREFETCH = 4  # images read together at the start
+RECENT = 2  # last images cached beyond the budget: a step asks more than once
+POSE_STEP = 1e-4  # resolution of compared poses, units of the scene
 
 
 class BitymiDataset(InputDataset):
-    """nerfstudio's dataset with images undistorted by their `Lens`; the model composes transparent ones, [H, W, 4]."""
+    """Dataset with images undistorted by their `Lens`; the model composes transparent ones, [H, W, 4]."""
 
     def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
         c2w = dataparser_outputs.cameras.camera_to_worlds
@@ -41,9 +41,9 @@ class BitymiDataset(InputDataset):
         c2w[:, :3, :3] = torch.from_numpy(parts)
         super().__init__(dataparser_outputs, scale_factor)
         self._summaries: dict[int, ImageSummary] = {}
-        # show missing photographs grey, where they are not asked for; else fail
+        # show missing photographs grey; else fail
         self.gray_images = self.facts.gray
-        self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # views of one photograph follow each other
+        self._read_shared = lru_cache(maxsize=RECENT)(read_image)  # views of one follow each other
 
     @property
     def facts(self) -> CaptureFacts:
@@ -148,7 +148,7 @@ class CachedImages(OnDemand[dict[str, Any]]):
 
 
 def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutputs:
-    """Leave out fully masked views; `split`: "training" or "held-out". Raises InputError: no training view is left."""
+    """Leave out fully masked views. Raises InputError: no training view is left."""
     masks = outputs.mask_filenames
     if not masks:
         return outputs
@@ -165,7 +165,7 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
 
 
 def capture_fingerprint(dataset: BitymiDataset) -> dict[str, Any]:
-    """Summarize the training views for checkpoints: number, and digests of names and poses."""
+    """Summarize the training views: number, and digests of names and poses."""
     poses = (dataset.cameras.camera_to_worlds / POSE_STEP).round().cpu().numpy()
     names = "\n".join(path.name for path in dataset.image_filenames)
     digests = {"names": names.encode("utf8", "surrogateescape"), "poses": poses.tobytes()}

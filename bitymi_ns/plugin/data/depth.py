@@ -23,13 +23,13 @@ from .facts import KEY, CaptureFacts, DepthFit, FittedMaps
 DepthKind = Literal["auto", "metric", "relative", "off"]
 """See `BitymiDataParserConfig.depth`."""
 SIDE = 320  # longest side of compared maps, pixels
-TOLERANCE = 0.05  # relative difference of depths of one surface
-FEW_PAIRS = 20  # fewest points in a photograph to fit scale and shift of its depth
-AGREES = 0.25  # least share of agreeing points for usable depth; hidden points disagree
+TOLERANCE = 0.05  # of depths of one surface, relative
+FEW_PAIRS = 20  # fewest points in a photograph to fit its depth
+AGREES = 0.25  # least share of agreeing points; hidden points disagree
 AGREE_MUTUALLY = 0.45
 """Least ratio, for usable depth, of pixels that another photograph confirms to those that it confirms or sees through.
 Measured: 0.95; with noise of 5 % 0.57; with the unit wrong by a factor of 0.001 to 1,000 at most 0.39."""
-BETTER = 0.15  # least gain in agreeing points, as a share, for relative depth
+BETTER = 0.15  # least gain in agreement for relative depth
 TRIALS = 200  # pairs of points for scale and shift
 SEEN_BY = 16  # photographs compared with a new point
 PIXELS_PER_POINT = 30  # pixels of training photographs per initial point
@@ -39,7 +39,7 @@ Floats = npt.NDArray[np.float64]
 
 
 class _Seen(NamedTuple):
-    """Depth map, lens and pose of a view: centre [3], rotation [3, 3] of OpenCV axes to world."""
+    """Depth map, lens and pose: centre [3], rotation [3, 3] of OpenCV axes to world."""
 
     values: Values
     lens: Lens
@@ -47,7 +47,7 @@ class _Seen(NamedTuple):
     rotation: Floats
 
     def fitted(self, fit: DepthFit) -> _Seen:
-        """Replace the map's values by camera z in units of the scene."""
+        """Replace the values by camera z in units of the scene."""
         return self._replace(values=fit.z(self.values))
 
 
@@ -55,7 +55,7 @@ def with_depth(
     outputs: DataparserOutputs, kind: DepthKind = "auto", unit: float | None = None, add_points: bool = True
 ) -> DataparserOutputs:
     """Fit depth maps of training views, downscaled to SIDE, to the scene, and add points from depth up to one per
-    PIXELS_PER_POINT pixels. Raises InputError: a map cannot be read, or its shape is not its photograph's."""
+    PIXELS_PER_POINT pixels. Raises InputError: a map cannot be read, or has another shape than its photograph."""
     facts = CaptureFacts.of(outputs.metadata)
     maps = facts.maps
     if kind == "off" or not maps:
@@ -107,7 +107,7 @@ def _check_normals(facts: CaptureFacts) -> None:
 
 
 def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, npt.NDArray[np.bool_]]:
-    """Project points [N, 3]: pixel (flat index), camera z, and whether they are in the picture."""
+    """Project points [N, 3]: pixel (flat index), camera z, whether in the picture."""
     to = view.lens.pinhole
     local = (xyz - view.center) @ view.rotation
     front = local[:, 2] > 0.0
@@ -169,7 +169,7 @@ def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> S
 
 
 def _pairs(view: _Seen, xyz: Floats) -> tuple[Floats, Floats]:
-    """Pair values of a map with camera z of the points in its picture."""
+    """Pair a map's values with camera z of the points in its picture."""
     pixels, z, inside = _project(xyz, view)
     values = view.values.ravel()[pixels]
     kept = inside & (values > 0.0)

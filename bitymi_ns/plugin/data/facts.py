@@ -18,11 +18,11 @@ from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.types import MapFiles
 from bitymi_ns.train.views import View
 
-KEY = "bitymi"  # of the record in nerfstudio's `metadata`, which it passes from parser to data set and model
+KEY = "bitymi"  # in nerfstudio's `metadata`
 
 
 class DepthFit(NamedTuple):
-    """Camera z in units of the scene from values v of a map: z, or 1 / z, is scale v + shift."""
+    """Camera z in units of the scene from a map's values v: z, or 1 / z, is scale v + shift."""
 
     scale: float
     shift: float = 0.0
@@ -37,7 +37,7 @@ class DepthFit(NamedTuple):
 
 
 class FittedMaps(NamedTuple):
-    """Maps of a view in units of the scene; fit None = depth is unused."""
+    """Maps of a view in units of the scene; fit None = no depth."""
 
     files: MapFiles
     fit: DepthFit | None
@@ -54,21 +54,21 @@ class CaptureFacts:
     """Facts of a capture: of views and poses by its parser, of the training views by the data manager."""
 
     lenses: Sequence[Lens] = ()  # of each view
-    files: Sequence[Path] = ()  # photograph of each view, which views may share
-    maps: Sequence[MapFiles] = ()  # files of depth and normals of each view; empty = there are none
-    fitted: Sequence[FittedMaps] = ()  # maps of each view in units of the scene; empty = none is used
+    files: Sequence[Path] = ()  # of each view, which may share one
+    maps: Sequence[MapFiles] = ()  # of each view; empty = there are none
+    fitted: Sequence[FittedMaps] = ()  # likewise, in units of the scene; empty = none is used
     lost: bool = False  # the photographs are gone; the views have no lenses
-    gray: bool = False  # lost photographs are grey; else they are refused
-    declares_box: bool = False  # the capture states the box of its scene; else the box is a default
-    poses_report: Path | None = None  # folder of the report on structure from motion; None = there is none
-    poses_found: Source | None = None  # by structure from motion; None = the capture came with poses
+    gray: bool = False  # lost photographs are grey, else refused
+    declares_box: bool = False  # the capture states its box; else that is a default
+    poses_report: Path | None = None  # folder of the report on structure from motion
+    poses_found: Source | None = None  # by structure from motion; None = came with the capture
 
-    alpha_color: Tensor | None = None  # [3] that the capture states behind transparent photographs
+    alpha_color: Tensor | None = None  # [3] behind transparent photographs, as the capture states
     has_alpha: bool = False  # the first training photograph has transparency
-    transparent: bool = False  # one of a few training photographs has, which decides the background `auto`
+    transparent: bool = False  # one of a few training photographs has
     train_pixels: int = 0  # of all training views
     camera_centers: Tensor = field(default_factory=lambda: torch.zeros(0, 3))  # [V, 3] of the training views
-    background_views: Sequence[View] = ()  # training views in which background points may be sought, read on demand
+    background_views: Sequence[View] = ()  # those in which background points may be sought
     seed: int = 0  # of the background points
 
     @staticmethod

@@ -20,13 +20,13 @@ from bitymi_ns.plugin.console import fail, listed, say
 from .facts import KEY, CaptureFacts
 
 DATA = "BITYMI_DATA"
-"""Environment variable with a capture's location, for which most of nerfstudio's commands have no option."""
+"""Environment variable with a capture's location, for which most commands have no option."""
 MOVED = f"If it was moved, say where it is now: `{DATA}=/where/it/is` before the command."
-LONGEST_SIDE = 1600  # default longest side of training photographs, pixels; as in papers on such captures
+LONGEST_SIDE = 1600  # of training photographs, pixels; as in papers on such captures
 
 
 class Views(DataparserOutputs):
-    """DataparserOutputs with a float64 dataparser_transform: captures may lie millions of units from the origin."""
+    """DataparserOutputs with float64 transforms: captures may lie millions of units from the origin."""
 
     def transform_poses_to_original_space(self, poses: torch.Tensor, *args: Any, **kwargs: Any) -> torch.Tensor:
         return super().transform_poses_to_original_space(poses.double(), *args, **kwargs)
@@ -65,7 +65,7 @@ def make_views(
         xyz = (points.xyz @ transform[:, :3].T + transform[:, 3]) * scale * capture.applied_scale
         metadata["points3D_xyz"] = torch.from_numpy(xyz.astype(np.float32))
         metadata["points3D_rgb"] = torch.from_numpy(points.rgb)
-    masks: list[Any] = [photographs[i].mask for i in sources]  # some may have none
+    masks: list[Any] = [photographs[i].mask for i in sources]
     views = Views(
         image_filenames=names,
         cameras=cameras,
@@ -100,12 +100,12 @@ def training_frame(poses: Pose, frame: FrameOptions, source: str) -> tuple[Pose,
     middle = poses[:, :3, 3].mean(0)
     local = poses.copy()
     local[:, :3, 3] -= middle
-    # the returned poses are not used: for `pca`, nerfstudio 1.1.5 turns an upside-down scene, but two cameras only
+    # the returned poses are unused: for `pca`, nerfstudio 1.1.5 turns only two cameras of an upside-down scene
     _, oriented = auto_orient_and_center_poses(
         torch.from_numpy(local.astype(np.float32)), frame.orientation_method, frame.center_method
     )
     transform = oriented.double().numpy()[:3].copy()
-    u, _, v = np.linalg.svd(transform[:, :3])  # far from the origin, the rounding of a rotation is a displacement
+    u, _, v = np.linalg.svd(transform[:, :3])  # rounding of a rotation displaces what is far from the origin
     transform[:, :3] = u @ v
     far = frame.center_method == "none" and far_from_origin(poses[:, :3, 3])
     if far:
@@ -135,7 +135,7 @@ def with_lenses(outputs: DataparserOutputs) -> DataparserOutputs:
     if KEY in outputs.metadata:
         return outputs
     cameras = outputs.cameras
-    if cameras.camera_to_worlds.ndim != 3:  # nerfstudio's Cameras lose the dimension of a single view
+    if cameras.camera_to_worlds.ndim != 3:  # Cameras lose the dimension of a single view
         fail(
             "nerfstudio's reader of this format fails on a single held-out photograph. Hold out more: "
             "`--eval-mode interval --eval-interval 4` after the reader's name."

@@ -1,11 +1,11 @@
-"""`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure the loss.
-
-Also `python -m bitymi_ns.plugin.export.command`."""
+"""`ns-export bitymi-atlas`: bake a trained scene into a bundle, and measure the loss."""
 
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
+from typing import Annotated
 
 import tyro
+from pydantic import Field
 
 from bitymi_ns import exit_messages
 from bitymi_ns.bake import BakeOptions, RefineOptions, TuneOptions, bake, export
@@ -26,6 +26,7 @@ from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.progress import rich_progress
+from bitymi_ns.ranges import Count, check_ranges
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
 from .summary import print_summary
@@ -44,16 +45,16 @@ class ExportAtlas(BakeOptions):
     exact: bool = False
     """Keep everything: tiles at the field's Nyquist rate, not capped by the training views; unseen surfels; all sites
     of view colours; texels as trained or sampled, without fine-tuning."""
-    polish_steps: int | None = None
+    polish_steps: Count | None = None
     """Steps in which texels, geometry, opacities and view colours learn together from the training photographs, before
     tiles and view colours are reduced; 0 = none. Not given: 0 if texels learned in training, and on a GPU, which lacks
     kernels for it; else 300, or 4 per photograph if more."""
-    finetune_steps: int | None = None
+    finetune_steps: Count | None = None
     """Steps of fine-tuning texels alone, after the polish; 0 = none. Not given: 400 without a polish, 100 after one,
     each with 120 more on texels as stored; only 100 on stored texels if texels learned in training."""
-    finetune_memory: float = TuneOptions.cache_bytes / 1e9
-    """GB of memory for traced views in the fine-tuning; changes its time alone."""
-    compare: bool = True  # Render the held-out views from bundle and trained scene, and state the difference.
+    finetune_memory: Annotated[float, Field(ge=0, le=1e6)] = TuneOptions.cache_bytes / 1e9
+    """GB of memory for traced views; changes the time of fine-tuning alone."""
+    compare: bool = True  # State the difference from the trained scene in the held-out views.
 
     extras: tuple[Kind, ...] = ()
     """Also write the scene for other programs, into a folder of the bundle's name and .extras: gaussians (a preview as
@@ -61,16 +62,16 @@ class ExportAtlas(BakeOptions):
     does so later."""
     extras_frame: Frame = "scene"  # Frame of these files: the scene's, or the capture's own.
     check_room: bool = True
-    """Stop if the disk may have too little room, by an estimate that can be many times too high."""
-    photographs: bool = False  # Put the held-out photographs into the bundle, for viewers to show beside renders.
-    interchange: bool = False  # Write surfels.ply into a compact bundle, too; bundles of other formats have it.
-    compact_error: float = Compact.share
+    """Stop if the disk may have too little room, by an estimate that can be far too high."""
+    photographs: bool = False  # Put the held-out photographs into the bundle.
+    interchange: bool = False  # Write surfels.ply into a compact bundle, too.
+    compact_error: Annotated[float, Field(gt=0, lt=1)] = Compact.share
     """Share by which compacting may raise the mean square error against the training photographs, before texels are
     tuned; less if texels would become too coarse to learn."""
     target_mb: float | None = None
     """Largest size of a compact bundle in MB (10^6 bytes), instead of compact_error; smaller if the photographs are
     shown as well, to 0.01 dB."""
-    target_psnr: float | None = None
+    target_psnr: Annotated[float, Field(ge=1, le=100)] | None = None
     """PSNR in dB against the training photographs before texels are tuned, instead of compact_error: the smallest
     bundle that reaches it is made."""
 
@@ -100,26 +101,21 @@ class ExportAtlas(BakeOptions):
         options = BakeOptions(**{f.name: getattr(self, f.name) for f in fields(BakeOptions)})
         if self.exact:
             options = replace(options, tolerance=0.0, cap_by_views=False, drop_unseen=False)
-        for name, what in (("finetune", "fine-tuning"), ("polish", "polish")):
-            steps = getattr(self, f"{name}_steps")
-            if steps is not None and steps < 0:
-                fail(f"--{name}-steps must not be negative, it is {steps}; 0 = no {what}")
-        if not 0 <= self.finetune_memory <= 1e6:
-            fail(f"--finetune-memory must be from 0 to 1,000,000 GB, not {self.finetune_memory}")
+        try:
+            check_ranges(self)
+        except ValueError as error:
+            name, _, rule = str(error).partition(" ")
+            fail(f"--{name.replace('_', '-')} {rule}", error)
         try:
             options.check()
-        except (ValueError, RuntimeError) as error:  # an option out of range; the BC7 encoder is not installed
+        except (ValueError, RuntimeError) as error:  # the BC7 encoder may be missing
             fail(f"the scene cannot be baked: {error}", error)
         for name in ("interchange", "compact_error", "target_mb", "target_psnr"):
             if options.bundle_format != "compact" and getattr(self, name) != getattr(ExportAtlas, name):
                 fail(f"--{name.replace('_', '-')} is for --format compact, not {options.bundle_format}")
         self._compact(0)
-        if self.target_psnr is not None and not 1 <= self.target_psnr <= 100:
-            fail(f"--target-psnr must be from 1 to 100 dB, not {self.target_psnr}")
         if self.target_mb is not None and self.target_psnr is not None:
             fail("--target-mb and --target-psnr cannot be combined: leave one out")
-        if not 0 < self.compact_error < 1:
-            fail(f"--compact-error must lie between 0 and 1, not at {self.compact_error}")
         return options
 
     def _compact(self, beside: int) -> Compact:
@@ -173,7 +169,7 @@ class ExportAtlas(BakeOptions):
         try:
             if self.compare and len(datamanager.eval_dataset):
                 written["statistics"]["held_out"] = compare(model, datamanager, baked.scene).model_dump()
-        finally:  # a comparison that is interrupted leaves the bundle, without its result
+        finally:  # an interrupted comparison leaves the bundle, without its result
             bundle = export(baked, self.output_dir, world=world_of(datamanager), **written, **how)
         print_summary(self.output_dir, baked, bundle.info, self.target_mb)
         if self.extras:

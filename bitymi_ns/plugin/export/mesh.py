@@ -30,27 +30,27 @@ from bitymi_ns.scene.camera import Camera
 from .trained import load_trained, world_of
 
 NAME = "mesh"
-MOST_VIEWS = 400  # most fused training views, evenly spaced
+MOST_VIEWS = 400  # most fused views
 
 
 class MeshScene(NamedTuple):
     """Scene that a mesh is made of, on the device that draws it."""
 
-    surfels: Mapping[str, Tensor]  # geometry by name
+    surfels: Mapping[str, Tensor]
     render: Callable[[Camera], Tensor]  # [H, W, 3] colors of a view
-    cameras: Sequence[Camera]  # of the training views
+    cameras: Sequence[Camera]
     near: float  # nearest drawn depth, camera z
-    world: WorldEntry  # transform from the capture's frame to the scene's
-    alpha: TexelAlpha | None  # opacities of the texels; None = opaque
+    world: WorldEntry
+    alpha: TexelAlpha | None  # None = opaque
 
 
 @dataclass(kw_only=True)
 class ExportMesh(SurfaceOptions):
     """Extract the surface as a triangle mesh with vertex colors: TSDF fusion of median depths (open3d)."""
 
-    load_config: Path  # config.yml of a trained scene or of a bundle, or a bundle in one file.
+    load_config: Path  # config.yml of a trained scene, or a bundle.
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
-    format: MeshFormat = "ply"  # Format of the file; files of other formats stay.
+    format: MeshFormat = "ply"  # Files of other formats stay.
     frame: Frame = "capture"
     """Frame of the vertices: the capture's, in its unit of length, or the scene's, in which nerfstudio trains."""
     crop: bool = False  # Leave out the surfels that the bundle's notes.json hides.

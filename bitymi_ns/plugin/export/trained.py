@@ -50,7 +50,7 @@ def load_trained(load_config: Path, step: int | None = None) -> tuple[Any, Any]:
         fail(f"{load_config} is not the configuration of a trained scene: {error}", error)
     except (RuntimeError, EOFError, IndexError, AssertionError, OSError, ValueError, pickle.UnpicklingError) as error:
         detail = line_of(error) or (str(error).strip().splitlines() or [""])[0]
-        if isinstance(error, AssertionError) and not detail:  # nerfstudio's report of another kind of file
+        if isinstance(error, AssertionError) and not detail:  # nerfstudio's, of another kind of file
             fail(f"{load_config} is not the configuration of a trained scene. ns-train says where it is.", error)
         fail(f"the checkpoint of {load_config} cannot be loaded: {detail or type(error).__name__}", error)
     if not isinstance(pipeline.model, BitymiModel):
@@ -139,7 +139,7 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     elif run.is_dir():  # of the run or of its checkpoints
         folders = [folder for folder in (run, run.parent) if (folder / "config.yml").is_file()]
         run = (folders[0] if folders else run) / "config.yml"
-    with CONSOLE.capture():  # nerfstudio reports at length what it loads
+    with CONSOLE.capture():  # nerfstudio reports at length
         _, pipeline = load_trained(run, step)
     model, datamanager = pipeline.model, pipeline.datamanager
     train = to_cameras(datamanager.train_dataset.cameras, "cpu")

@@ -34,7 +34,7 @@ RENDERER, CROP = "BITYMI_RENDERER", "BITYMI_CROP"
 @dataclass
 class BakedModelConfig(SurfelModelConfig):
     _target: type = field(default_factory=lambda: BakedModel)
-    bundle: Path = Path()  # Folder of the bundle when written; a moved one is found beside its config.yml.
+    bundle: Path = Path()  # Its folder when written; a moved one is found beside its config.yml.
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)  # Colour behind the scene.
     renderer: Literal["kernels", "fast", "webgpu"] = "kernels"
     """kernels: on CUDA or the CPU; fast: the same, but a pixel ends when what follows adds less than half an 8-bit
@@ -85,7 +85,7 @@ class BakedModel(SurfelModel):
         wanted = box_of(box)
         if wanted != self.crop_box:
             renderer = self._new_renderer(wanted)
-            self.crop_box, self._renderer = wanted, renderer  # in one line, as the viewer may interrupt after any
+            self.crop_box, self._renderer = wanted, renderer  # at once: the viewer may interrupt
 
     def _new_renderer(self, box: Box | None) -> SceneRenderer:
         scene = self._scene
@@ -118,8 +118,8 @@ class BakedModel(SurfelModel):
 
 
 def check_same_capture(bundle: Path, pipeline: Any) -> None:
-    """Check that a bundle is of the capture that a pipeline has read, in the same frame: half of its cameras need one
-    of the capture's within 5 % of their extent and 5 degrees. Raises InputError: it is not."""
+    """Check that a bundle is of a pipeline's capture, in the same frame: half of its cameras need one of the capture's
+    within 5 % of their extent and 5 degrees. Raises InputError: it is not."""
     stated = [row.camera for row in read_cameras(bundle)]
     if not stated:
         return

@@ -36,7 +36,7 @@ from bitymi_ns.train.views import OnDemand, TrainingData, covered_fraction
 from bitymi_ns.trust import json_of, no_links
 from .memory import state_training
 
-SOON = 60  # seconds: when a run that takes less will end is not said
+SOON = 60  # seconds; shorter runs do not state their end
 
 
 class TrainingRun:
@@ -44,7 +44,7 @@ class TrainingRun:
     `after`."""
 
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
-        trainer: Any = attributes.trainer  # nerfstudio declares those of every method
+        trainer: Any = attributes.trainer  # nerfstudio declares another type
         pipeline: Any = attributes.pipeline
         assert trainer is not None and pipeline is not None and attributes.optimizers is not None
         self.scene, self.config, self._curve_views = model.scene, model.train_config, model.config.curve_views
@@ -67,7 +67,7 @@ class TrainingRun:
             self.training.load_state_dict({"max_steps": model.trained_for, **resume_state})
             self._random_state = resume_state["random"]
             warn_of_other_capture(resume_state.get("capture"), self.capture)
-        # steps after which the curve gets a point: evenly spaced, with the last one
+        # evenly spaced, with the last one
         self.curve_steps = {max(0, round(self.total * (i + 1) / curve_points) - 1) for i in range(curve_points)}
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
@@ -75,7 +75,7 @@ class TrainingRun:
         )
         self.names = {"experiment_name": trainer.config.experiment_name, "method_name": trainer.config.method_name}
         self._end_said = False
-        self._held_back = False  # densification has met its bound, and a warning said so
+        self._held_back = False  # a warning said that densification met its bound
         for sentence in (
             *messages.other_options(model.recorded_options, config),
             *messages.short_run(self.training.schedule, len(train), scene.config.texture == "hash", processes.views),
@@ -110,7 +110,7 @@ class TrainingRun:
             return
         try:
             self.forecast.compare_sizes(step, {size: self.training.seconds_at(size) for size in sorted(sizes)})
-        except (TrainingDiverged, MemoryError, RuntimeError) as error:  # a run ends where its own steps raise these
+        except (TrainingDiverged, MemoryError, RuntimeError) as error:  # its own steps end a run
             if not isinstance(error, TrainingDiverged) and not exit_messages.out_of_memory(error):
                 raise
         give_back_memory()

@@ -27,12 +27,12 @@ PROTO STOP MARK NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT BINU
 TUPLE3 EMPTY_LIST APPEND APPENDS EMPTY_DICT SETITEM SETITEMS BINPUT LONG_BINPUT BINGET LONG_BINGET GLOBAL REDUCE BUILD
 BINPERSID
 """.split()
-]  # instructions that torch.save writes
+]  # written by torch.save
 
 
 def read_archive(file: BinaryIO) -> Any:
     """Read what `torch.save` wrote: tables, lists, text, numbers and CPU tensors. Raises ValueError,
-    pickle.UnpicklingError and what zipfile raises: it is damaged, or holds anything else."""
+    pickle.UnpicklingError and what zipfile raises."""
     with ZipFile(file) as archive:
         parts = archive.infolist()
         names = [part.filename for part in parts]
@@ -90,7 +90,7 @@ class _Reader(pickle._Unpickler):
             raise ValueError(f"{key} does not hold {count} numbers of {dtype}")
         return raw.view(dtype)
 
-    def _ignore_state(self) -> None:  # _metadata of torch.nn's tables, byte order of numpy's types
+    def _ignore_state(self) -> None:  # _metadata of torch.nn, byte order of numpy
         self.stack.pop()
 
     def _set_item(self) -> None:

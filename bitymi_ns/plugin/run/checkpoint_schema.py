@@ -22,10 +22,10 @@ from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.train.strategy import STATISTICS
 from bitymi_ns.trust import json_of
 
-EXTRA_STATE = "_extra_state"  # torch's name of a module's state beside tensors
+EXTRA_STATE = "_extra_state"  # of torch, for a module's state beside tensors
 SCENE = "_model.scene."  # prefix of the scene's parameters
 SURFELS = f"{SCENE}surfels."
-LARGEST = 1e15  # absolute value of a drawable parameter: its square, and sums of squares, are finite in float32
+LARGEST = 1e15  # of a drawable parameter: its square is finite in float32
 _FIELD_GROUPS = {"field_table": ("field.field_table",), "field_mlp": tuple(f"field.field_w{i}" for i in (1, 2, 3))}
 """Parameters of the optimisers that are not named after one surfel parameter."""
 
@@ -86,7 +86,7 @@ class Entry:
 
     def tensor(self, *shape: int | None, dtype: torch.dtype | None = torch.float32) -> Tensor:
         """Return a contiguous tensor of this shape, None = any size; with dtype None, of any shape and dtype. A file's
-        strides may reach beyond its numbers, or it may hold none of them (device meta)."""
+        strides may reach beyond its numbers, or it may hold none (device meta)."""
         value = self.value
         plain = type(value) in (Tensor, Parameter) and value.layout == torch.strided and not value.is_meta
         fits = plain and dtype in (None, value.dtype) and value.is_contiguous()
@@ -120,8 +120,8 @@ def check_unwritten(state: Mapping[str, Any], scene: SceneConfig) -> None:
 
 
 def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
-    """Check all entries of a checkpoint, and return the names of parameters with numbers that are not finite, or too
-    large to be drawn. Raises Misfit."""
+    """Check all entries of a checkpoint; return the names of parameters with numbers that are not finite, or too large
+    to be drawn. Raises Misfit."""
     drawable = {
         name.removeprefix("_model."): (values.abs() <= LARGEST).reshape(len(values), -1).all(1)
         for name, values in check_entries(state, scene).items()
@@ -133,8 +133,8 @@ def check(state: Mapping[str, Any], scene: SceneConfig) -> list[str]:
 
 
 def check_entries(state: Mapping[str, Any], scene: SceneConfig) -> dict[str, Tensor]:
-    """Check all entries of a checkpoint against the configuration of its scene; those that other versions lack may be
-    missing. Return the scene's parameters by name. Raises Misfit: an entry is missing or wrong."""
+    """Check all entries against the scene's configuration; those that other versions lack may be missing. Return the
+    scene's parameters by name. Raises Misfit."""
     root = Entry(dict(state))
     step = root["step"].count()
     pipeline = root["pipeline"]

@@ -22,14 +22,14 @@ MAY_DIFFER = ("near", "weight_bound", "rim", "texture_moves_surfels", "max_fragm
 
 
 def save(state: dict[str, Any], path: Path, scratch: Path, scene: SceneConfig) -> None:
-    """Write a checkpoint that `load` takes; on any failure the previous ones stay as they were. The unfinished file
-    lies in `scratch`, on the same file system: nerfstudio takes any file beside the checkpoints for one."""
+    """Write a checkpoint that `load` takes; on failure the previous ones stay. The unfinished file lies in `scratch`,
+    on the same file system: nerfstudio takes any file beside the checkpoints for one."""
     try:
         check_unwritten(state, scene)
         with complete_file(path, scratch) as file:
             torch.save(state, file)
     except (OSError, RuntimeError, Misfit) as error:
-        # after a failed write torch still ends its archive, and reports that: the disk's error is in its context
+        # torch still ends its archive, and reports that: the disk's error is in the context
         behind: BaseException | None = error
         while behind is not None and not isinstance(behind, OSError):
             behind = behind.__context__

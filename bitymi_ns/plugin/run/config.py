@@ -40,7 +40,7 @@ SEEDS = 1 << 32  # end of numpy's range of seeds
 @dataclass
 class BitymiTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: BitymiTrainer)
-    read_from = None  # folder of a config.yml loaded for evaluation; no field, to stay out of config.yml
+    read_from = None  # of a config.yml loaded for evaluation; no field, to stay out of config.yml
     vis: Literal[
         "none", "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet",
         "viewer_legacy",
@@ -48,17 +48,17 @@ class BitymiTrainerConfig(TrainerConfig):
     """Visualizer; none = no viewer, and no log but the training curve."""
     max_num_iterations: int | None = None
     """Length of the run in steps; schedules scale with it. Not given: --default-iterations, or as before if resumed."""
-    default_iterations: int = 30_000  # Steps of a run on a GPU when --max-num-iterations is not given.
+    default_iterations: int = 30_000  # Steps on a GPU if --max-num-iterations is not given.
     default_iterations_cpu: int = 3_000
-    """Steps of a run without a supported GPU when --max-num-iterations is not given."""
+    """Steps without a supported GPU."""
     steps_per_save: int | None = None
-    """Number of steps between checkpoints; not given: see --default-saves."""
-    default_saves: int = 5  # Checkpoints written over a run when --steps-per-save is not given.
+    """Steps between checkpoints; not given: see --default-saves."""
+    default_saves: int = 5  # Checkpoints of a run if --steps-per-save is not given.
     prompt: tyro.conf.Suppress[str | None] = None  # Of nerfstudio's text-to-scene methods.
     optimizers: tyro.conf.Suppress[dict[str, Any]] = field(default_factory=dict)
     """By parameter group; the rates come from --pipeline.model.train.lr."""
 
-    if TYPE_CHECKING:  # nerfstudio declares those of every method
+    if TYPE_CHECKING:  # nerfstudio declares another type
         pipeline: Any = None
 
     def __post_init__(self) -> None:
@@ -94,7 +94,7 @@ class BitymiTrainerConfig(TrainerConfig):
         self._check_options()
         if not several and (self.machine.num_machines, self.machine.num_devices) != (1, 1):
             torchrun.run(self)
-        if self.machine.seed != MachineConfig().seed:  # for the other seeds that are not given
+        if self.machine.seed != MachineConfig().seed:  # for seeds that are not given
             pipeline = self.pipeline
             for owner, name in ((pipeline.datamanager, "train_cameras_sampling_seed"), (pipeline.model.train, "seed")):
                 if getattr(owner, name) == type(owner).__dataclass_fields__[name].default:
@@ -146,7 +146,7 @@ class BitymiTrainerConfig(TrainerConfig):
         folder_lock.take(folder)
         with write_errors_as(folder, InputError, " (--output-dir)."):
             write_file(folder / "config.yml", yaml.dump(recorded).encode("utf8"))
-        # what follows in nerfstudio would start the processes its own way, see `torchrun`
+        # else nerfstudio would start the processes its own way
         self.machine = replace(self.machine, num_machines=1, num_devices=1)
         say(self.summary())
 
@@ -184,7 +184,7 @@ class BitymiTrainerConfig(TrainerConfig):
 
     def _make_paths_absolute(self) -> None:
         datamanager = self.pipeline.datamanager
-        if datamanager.data is None:  # given to the dataparser; the experiment is named after this one
+        if datamanager.data is None:  # given to the dataparser
             datamanager.data = getattr(datamanager.dataparser, "data", None)
         for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
             path = getattr(owner, "data", None)
@@ -248,16 +248,16 @@ def method_config(name: str) -> MethodSpecification:
     config = BitymiTrainerConfig(
         method_name=preset.name,
         machine=MachineConfig(device_type="cuda" if has_cuda_kernels() else "cpu"),
-        # the training curve measures what these would
+        # the training curve replaces these
         **dict.fromkeys(("steps_per_eval_batch", "steps_per_eval_image", "steps_per_eval_all_images"), 0),
         mixed_precision=False,
         pipeline=BitymiPipelineConfig(
             datamanager=BitymiDataManagerConfig(dataparser=BitymiDataParserConfig()),
             model=BitymiModelConfig(scene=preset.scene, train=preset.train),
         ),
-        # one optimiser per parameter group, no scheduler: the model sets the rates
+        # no scheduler: the model sets the rates
         optimizers={group: {"optimizer": optimizer(group), "scheduler": None} for group in PARAMETER_GROUPS},
-        # a progress bar replaces the table; profiles of nerfstudio's functions say nothing about ours
+        # a progress bar replaces the table
         logging=LoggingConfig(local_writer=LocalWriterConfig(enable=False), profiler="none"),
         viewer=ViewerConfig(websocket_host=hooks.LOOPBACK, quit_on_train_completion=True),
     )

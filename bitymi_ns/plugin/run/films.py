@@ -20,8 +20,8 @@ from bitymi_ns.files import complete_file, complete_folder, write_file
 from bitymi_ns.plugin.console import fail
 from bitymi_ns.scene.baked import as_bytes
 
-RATES = (0.01, 1000.0)  # frames per second of a film
-QUALITY = "18"  # constant rate factor of H.264 with hardly visible loss
+RATES = (0.01, 1000.0)  # frames per second
+QUALITY = "18"  # constant rate factor: hardly visible loss
 ENDINGS = {"jpeg": ".jpg", "png": ".png"}
 FRAME = re.compile(r"\d{5}\.(jpg|png)")
 
@@ -32,8 +32,8 @@ Add = Callable[[np.ndarray], None]
 @contextmanager
 def film(path: Path, fps: float) -> Iterator[Add]:
     """Open a film for all browsers: 8 bits, yuv420p of BT.709, index in front; it replaces an earlier one at the end.
-    H.264 with halved colour needs even sizes: odd ones lose the last row or column. Raises InputError: the size does
-    not suit H.264; OSError: it cannot be written."""
+    Odd sizes lose the last row or column. Raises InputError: the size does not suit H.264; OSError: it cannot be
+    written."""
     import av
     from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTrc
 
@@ -44,7 +44,7 @@ def film(path: Path, fps: float) -> Iterator[Add]:
         nonlocal stream
         height, width = (size - size % 2 for size in image.shape[:2])
         if stream is None:
-            rate = Fraction(fps).limit_denominator(1001)  # 24000/1001 is one that is in use
+            rate = Fraction(fps).limit_denominator(1001)  # as 24000/1001
             stream = container.add_stream("libx264", rate=rate, options={"crf": QUALITY})
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             context = stream.codec_context
@@ -96,7 +96,7 @@ def write_image(path: Path, image: np.ndarray, *, fmt: str, quality: int = 100) 
 
 
 def _save(file: IO[bytes], image: np.ndarray, form: str, quality: int) -> None:
-    encoded = io.BytesIO()  # Pillow hides why it cannot write to a file
+    encoded = io.BytesIO()  # Pillow hides why writing fails
     picture = Image.fromarray(image)
     if form == "jpeg":
         picture.save(encoded, form, quality=quality, comment=RENDERED)

@@ -12,7 +12,7 @@ from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.trust import check_no_links
 
 LOCK = ".lock"  # file of a training process
-POSES = "poses"  # subfolder of poses that this package found, and their report
+POSES = "poses"  # subfolder of found poses and their report
 
 
 def take(folder: Path) -> None:
@@ -43,13 +43,13 @@ def leave(folder: Path) -> None:
 
 
 def keep_poses_report(folder: Path, report: Path | None, source: Source | None = None) -> None:
-    """Copy found poses and their report to POSES, to outlast the photographs; None = the capture came with poses."""
+    """Copy found poses and their report to POSES, to outlast the photographs."""
     there = [] if report is None else [report / name for name in FILES if (report / name).is_file()]
     origin = None if source is None else source.origin
     if origin is None and not there:
         return
     if report is not None and report.resolve() == (folder / POSES).resolve():
-        return  # the run goes on with what it keeps already
+        return
     try:
         check_no_links([folder / POSES])
         with files.complete_folder(folder / POSES, tell=warn) as new:

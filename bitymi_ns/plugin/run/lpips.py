@@ -38,8 +38,8 @@ LAYERS: dict[str, tuple[tuple[int, ...], ...]] = {
 """Convolutions of a backbone: channels in and out, side of the kernel."""
 TAPS = {"alex": (0, 1, 2, 3, 4), "vgg": (1, 3, 6, 9, 12)}  # convolutions with compared features
 POOLED = {"alex": (1, 2), "vgg": (2, 4, 7, 10)}  # convolutions after pooling
-LEAST_SIDE = 32  # of an image for the backbones, pixels
-FETCH_TIMEOUT = 600.0  # seconds that pip may take
+LEAST_SIDE = 32  # pixels
+FETCH_TIMEOUT = 600.0  # seconds
 
 
 class LpipsUnavailable(RuntimeError):

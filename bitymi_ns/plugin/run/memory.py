@@ -34,31 +34,31 @@ from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget
 
 COUNTED_VIEWS = 3  # views with counted fragments
-MARGIN = 1.1  # factor by which other views may have more fragments
+MARGIN = 1.1  # other views may have more fragments
 PROGRAM = 800e6  # bytes of Python, libraries, and a capture's cameras and points
 FREED = 500e6
 """Bytes of freed blocks, each too small to be returned, that are kept for later views; less for small ones, which take
 `KEPT_LISTS` times their lists and pictures so, and more for large ones, `KEPT_LISTS` times their pictures."""
 KEPT_LISTS = 2
-MOST_KEPT = 2.8e6  # pixels of a picture whose colours are such a block; those of larger ones are returned
+MOST_KEPT = 2.8e6  # pixels of a picture of such a block; larger ones are returned
 PER_SHADED_FRAGMENT = 60
 """Further bytes with a hash-grid field: surfels, pixels, points and residuals, and their gradients."""
 PER_GPU_FRAGMENT = 4 * NUMBERS  # bytes on a GPU in lists of training
-PER_PASSING_FRAGMENT = 36  # bytes on a GPU in temporary lists, for the coverage of texels; pictures need no list
+PER_PASSING_FRAGMENT = 36  # bytes on a GPU in temporary lists, for the coverage of texels
 PER_BAKED_FRAGMENT = 48
 """Bytes on a GPU in the fine-tuning of an export: 28 of the list, 1 + 36 of the part that shows texels, at most 43 % as
 measured, and 3 of the pairs of surfel and tile."""
-PER_BAKED_TEXEL = 96  # bytes in an export: eight copies, as learned, listed, tuned, and in pages
+PER_BAKED_TEXEL = 96  # bytes in an export: eight copies
 PER_KEPT_FRAGMENT, PER_KEPT_PIXEL = 20 * 0.22, 24
 """Bytes of a view that the fine-tuning keeps; 22 to 43 % of the fragments show a texel."""
 VIEWS_OF_TEXELS = 7  # views' worth of texels; 3.7 to 15 were measured
-SPREAD = 1.3  # factor of the stated figures to either side of the estimate
+SPREAD = 1.3  # factor to either side of the estimate
 
 
 @torch.no_grad()
 def most_fragments(scene: Scene, cameras: Sequence[Camera], bound: int = 0) -> int:
-    """Estimate the most fragments at once of any of these views, by a count of a few; those with more than `bound` (0 =
-    what fits) are drawn in bands."""
+    """Estimate the most fragments of any of these views, by a count of a few; those with more than `bound` (0 = what
+    fits) are drawn in bands."""
     p, most = scene.surfels, 0
     for i in spread(len(cameras), COUNTED_VIEWS):
         camera = cameras[i].to("cpu")
@@ -78,9 +78,9 @@ def state_training(
     processes: int = 1,
     lists: bool = False,
 ) -> None:
-    """Print the memory estimate of a training run, from its `scene` at the start, the cameras of its views, on the CPU,
-    and the expected largest number of surfels. `texels`: options of those that learn (None = none), from `to_come`
-    renders. `processes`: of equal need on this machine. `lists`: losses need lists of fragments on a GPU, too."""
+    """Print the memory estimate of a training run, from its first `scene`, the views' cameras, on the CPU, and the
+    expected largest number of surfels. `texels`: options of those that learn, from `to_come` renders. `processes`: of
+    equal need on this machine. `lists`: losses need lists of fragments on a GPU."""
     (pixels, total), device = _pixels(cameras), scene.surfels["means"].device
     on_gpu = device.type == "cuda"
     fragments = most_fragments(scene, cameras, scene.config.max_fragments)
@@ -99,9 +99,9 @@ def state_training(
         most = min(VIEWS_OF_TEXELS * pixels / texels.pixels_per_texel, most_texels(texels, to_come * pixels))
         most = max(most, SMALLEST**2 * KEPT * surfels)
         grown = max(grown, KEPT * grown + (PER_TEXEL + on_gpu * PER_TEXEL_SUM) * most)
-        grown += len(cameras) * KEPT * surfels  # of `Visibility`, at most a byte for each surfel and view
+        grown += len(cameras) * KEPT * surfels  # of `Visibility`, at most
     needed += grown
-    if on_gpu:  # a bound on fragments would bring lists, which take more memory
+    if on_gpu:  # a bound would bring lists, which take more
         fewer = f"train fewer surfels (--max-surfels {max(1, int(surfels / 2))})"
         advice = f"{fewer} or smaller photographs (--downscale-factor 2)"
     else:
@@ -114,9 +114,9 @@ def state_training(
 def state_export(
     scene: Scene, cameras: Sequence[Camera], finetune_bytes: float, learning: int = 0, compact: bool = False
 ) -> None:
-    """Print the memory estimate of an export, from the cameras of the training views, on the CPU. `finetune_bytes`: for
-    the views that the fine-tuning keeps (0 = none). `learning`: number of surfels that learn in the polish. `compact`:
-    terms of view colours are chosen by rate-distortion."""
+    """Print the memory estimate of an export, from the training views' cameras, on the CPU. `finetune_bytes`: for the
+    views that the fine-tuning keeps. `learning`: number of surfels that learn in the polish. `compact`: view colours
+    are chosen by rate-distortion."""
     pixels, total = _pixels(cameras)
     kept = min(PHOTOGRAPH_BYTES, 3 * total)
     fragments = most_fragments(scene, cameras)
@@ -129,7 +129,7 @@ def state_export(
     entry = VIEW_COLORS[kind]
     terms = scene.surfels[entry.parameters[1].name].shape[1] - entry.base_terms
     chosen = choice_bytes(kind, len(scene), len(cameras), terms) if compact else 0
-    seen = 4 * len(cameras) * len(scene)  # of `Visibility`, for all surfels and for drawn ones
+    seen = 4 * len(cameras) * len(scene)  # of `Visibility`
     needed += max(seen, chosen, finetune_bytes + PER_SURFEL * learning)  # one after the other
     if isinstance(scene.field, TexelField):
         needed += PER_BAKED_TEXEL * len(scene.field.texels)

@@ -55,7 +55,7 @@ def flip(image: Tensor, reference: Tensor) -> float | None:
     except ImportError as error:
         warn_once(f"FLIP is left out: {error} (pip install flip-evaluator).")
         return None
-    # LDR, sRGB input, no colour map, with mean error, default viewing conditions
+    # LDR, sRGB, no colour map, with mean error, default viewing conditions
     pair = (reference.cpu().contiguous().numpy(), image.cpu().contiguous().numpy())
     _, mean, _ = nbflip.evaluate(*pair, False, True, False, True, {})
     return float(mean)
@@ -65,7 +65,7 @@ def lpips_metrics(image: Tensor, reference: Tensor, names: Sequence[str]) -> dic
     """Measure distances by names in `LPIPS`; empty without weights, or below 32 pixels along a side."""
     found: dict[str, float] = {}
     for name in names if min(image.shape[:2]) >= lpips.LEAST_SIDE else ():
-        if name in _lpips_missing:  # fetched together: the next one is missing, too
+        if name in _lpips_missing:  # the next one is missing, too
             break
         try:
             found[name] = lpips.lpips(image, reference, LPIPS[name])

@@ -41,12 +41,12 @@ PARAMETER_GROUPS = (*PARAMETERS, "field_table", "field_mlp")
 @dataclass
 class BitymiModelConfig(SurfelModelConfig):
     _target: type = field(default_factory=lambda: BitymiModel)
-    scene: SceneConfig = field(default_factory=SceneConfig)  # Representation of the scene.
+    scene: SceneConfig = field(default_factory=SceneConfig)  # The scene's options.
     train: TrainConfig = field(default_factory=TrainConfig)  # Training options.
     steps: tyro.conf.Suppress[int | None] = None  # Length of a run to come.
     curve_points: int = 20
     """Evaluations over a run for the curve of quality against time; 0 = none."""
-    curve_views: int = 8  # Held-out views per point of that curve, all for the last one; 0 = all.
+    curve_views: int = 8  # Held-out views per point; all for the last one; 0 = all.
 
 
 def train_config_for(config: TrainConfig, alpha_color: Tensor | None, transparent: bool) -> TrainConfig:
@@ -76,12 +76,12 @@ class BitymiModel(SurfelModel):
         points = self.kwargs.pop("seed_points", None)
         config, steps = self.config.scene, self.config.steps
         self.scene = new_scene(points, self.scene_box, config, self.train_config, self.facts, steps)
-        self.first_surfels = len(self.scene)  # checkpoints may have another number
+        self.first_surfels = len(self.scene)
         self.trained_for: int | None = None
         self.resume_state: dict[str, Any] = {}
         self.recorded_options: str | None = None  # of a resumed run
         self.run: TrainingRun | None = None  # in training
-        self.carry: Callable[[Camera], Camera] | None = None  # of a finished run that refined poses
+        self.carry: Callable[[Camera], Camera] | None = None  # if a finished run refined poses
 
     @property
     def background(self) -> Tensor:
@@ -166,7 +166,7 @@ class BitymiModel(SurfelModel):
         self.resume_state, self.recorded_options = state.get("run", {}), state.get("train")
         self.first_surfels = state.get("first_surfels", self.first_surfels)
         if self.config.scene.near is None:
-            self.scene.near = state.get("near", 0.2)  # all scenes' value in older checkpoints
+            self.scene.near = state.get("near", 0.2)  # in older checkpoints
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Load a checkpoint of any number of surfels, which `checkpoints.load` has checked."""
@@ -174,13 +174,13 @@ class BitymiModel(SurfelModel):
         for name, parameter in self.named_parameters():
             saved = state_dict.get(name)
             if saved is not None and saved.shape != parameter.shape:
-                # nerfstudio's optimisers hold the Parameter object already
+                # the optimisers hold the Parameter already
                 parameter.data = torch.zeros(saved.shape, dtype=parameter.dtype, device=parameter.device)
         return super().load_state_dict(state_dict, strict=True)
 
 
-MANY_POINTS = 500_000  # points from which on surfels take long enough to say so
-FEW_POINTS = 50  # points below which much of a scene may have none near it
+MANY_POINTS = 500_000  # points, of which surfels take long to make
+FEW_POINTS = 50  # below, much of a scene may have none near it
 
 
 def new_scene(
@@ -200,7 +200,7 @@ def new_scene(
     xyz, rgb = xyz.detach().reshape(-1, 3), rgb.detach()
     if rgb.shape[:1] == xyz.shape[:1]:
         rgb = rgb.float().reshape(-1, 3) / (255.0 if rgb.dtype == torch.uint8 else 1.0)
-    else:  # a cloud without colours
+    else:
         rgb = torch.full_like(xyz, 0.5, dtype=torch.float32)
     xyz = xyz.float()
     declared = None if scene_box is None or not facts.declares_box else _corners(scene_box)
@@ -213,7 +213,7 @@ def new_scene(
     if many:
         say(f"Making surfels of {len(xyz):,} points. This may take minutes.")
     background, views = None, facts.background_views
-    if len(xyz) and len(views) and train.background_points:  # reads the photographs
+    if len(xyz) and len(views) and train.background_points:
         background = background_points(xyz, views, facts.seed)
     scene, report = build_scene(xyz, rgb, centers, config, train, facts.has_alpha, pixels, box, declared, background)
     if many:

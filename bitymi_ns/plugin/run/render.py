@@ -26,8 +26,8 @@ from .surfel_model import SurfelModel
 
 TRAJECTORIES = ("RenderCameraPath", "RenderInterpolated", "SpiralRender")
 """nerfstudio's script classes that render along a path."""
-OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")  # outputs of every surfel scene
-WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}  # outputs drawn without maps
+OUTPUTS = ("rgb", "rgba", "accumulation", "depth", "normal", "beta", "overdraw")
+WITHOUT_MAPS = {"rgb", "rgba", "accumulation"}
 DEPTH_VIEWS, DEPTH_SIDE, DEPTH_SHARE = 16, 160, 0.01
 """Frames sampled for a film's depth range, their longer side in pixels, and the share of depths clipped at either
 end."""
@@ -143,7 +143,7 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
         )
     path = stock(cameras=cameras, **options)
     points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
-    along = stock(cameras=points, **options)  # principal points in the fields of focal lengths
+    along = stock(cameras=points, **options)  # in the fields of focal lengths
     path.cx, path.cy = along.fx, along.fy
     for name in ("width", "height"):
         setattr(path, name, torch.full_like(getattr(path, name), int(getattr(cameras, name)[0])))
@@ -160,7 +160,7 @@ def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
 @torch.no_grad()
 def spiral(model: SurfelModel, start: Cameras, steps: int, radius: float) -> Cameras:
     """Make cameras on a spiral around `start`, `radius` scene units along its axes, all facing the point at the median
-    depth of its image's centre. nerfstudio's spiral rolls: it takes a world axis for the camera's up axis."""
+    depth of its image's centre; nerfstudio's spiral rolls."""
     camera = to_camera(start, model.device).within(DEPTH_SIDE)
     outputs = model.outputs_of(camera, maps=True)
     y, x = camera.height // 3, camera.width // 3

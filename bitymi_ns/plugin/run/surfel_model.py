@@ -47,8 +47,8 @@ def box_of(box: OrientedBox | None) -> Box | None:
 
 
 class SurfelModel(Model):
-    measure_time = True  # include render_ms in the image metrics; off in training
-    crop_box: Box | None = None  # hides the surfels whose centres lie outside
+    measure_time = True  # measures render_ms; off in training
+    crop_box: Box | None = None  # hides surfels with centres outside
     corrections: Sequence[tuple[Camera, Tensor | None]] = ()
     """Cameras of the capture's photographs with their colour corrections, if the run made some."""
 
@@ -83,9 +83,9 @@ class SurfelModel(Model):
         return self.outputs_of(to_camera(ray_bundle, self.device), maps=True)
 
     def outputs_of(self, camera: Camera, maps: bool) -> dict[str, Tensor]:
-        """Draw the outputs of viewer and ns-render, each [H, W, C] float32: rgb, accumulation; with maps also depth =
-        expected distance along the ray (not z), normal = world normal as (n + 1) / 2 (0 for none), beta = blended
-        kernel exponent / 4, overdraw = surfels blended at the pixel / OVERDRAW_SCALE."""
+        """Draw the outputs of viewer and ns-render, [H, W, C] float32: rgb, accumulation; with maps also depth =
+        expected distance along the ray, normal = world normal as (n + 1) / 2 (0 for none), beta = blended kernel
+        exponent / 4, overdraw = surfels blended at the pixel / OVERDRAW_SCALE."""
         output = self.render(camera, self.background, maps=maps)
         outputs = {"rgb": output.rgb.clamp(0.0, 1.0), "accumulation": output.alpha}
         if output.depth is not None:
@@ -100,8 +100,8 @@ class SurfelModel(Model):
 
     @torch.no_grad()
     def get_outputs_for_camera(self, camera: Cameras, obb_box: OrientedBox | None = None) -> dict[str, Tensor]:
-        """Render a camera, with only the surfels in the crop box if one is given. In the viewer's thread, which a
-        refusal would end, a camera that cannot be rendered gives an empty picture."""
+        """Render a camera, with only the surfels in the crop box if given. In the viewer's thread, which a refusal
+        would end, a camera that cannot be rendered gives an empty picture."""
         self.crop_to(obb_box)
         try:
             self._last_camera = to_camera(camera, self.device)
@@ -116,7 +116,7 @@ class SurfelModel(Model):
         return {name: value for name, value in outputs.items() if isinstance(value, Tensor)}
 
     def photograph(self, batch: dict[str, Any], rgb: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Return the batch's photograph [H, W, 3] over the background, and its mask [H, W, 1], at a render's size."""
+        """Return the batch's photograph [H, W, 3] over the background and its mask [H, W, 1], at a render's size."""
         height, width = rgb.shape[:2]
         target = downscale_image(as_float(batch["image"].to(rgb.device)), width, height)
         mask = batch.get("mask")

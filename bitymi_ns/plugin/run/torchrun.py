@@ -27,22 +27,21 @@ if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
 
 TIMEOUT = timedelta(minutes=30)  # timeout for a process that does not answer; one that has ended is noticed at once
-SETUP = timedelta(days=7)  # timeout for the first process to read the capture and to find its poses
-LOST = 3  # exit status of a process that ends because another one has
-CONFIG = "config"  # file of the pickled configuration, and its key in torch.distributed's store
+SETUP = timedelta(days=7)  # for the first process to read the capture and find poses
+LOST = 3  # exit status if another process has ended
+CONFIG = "config"  # of the pickled configuration: file, and key in torch.distributed's store
 
 
 def own(group: str = "") -> Processes:
-    """Return this process's rank in the run and the number of processes; LOCAL_: on this machine; GROUP_: rank and
-    number of machines."""
+    """Return the rank of this process and the number of processes in the run; LOCAL_: on this machine; GROUP_: of
+    machines."""
     if "TORCHELASTIC_RUN_ID" not in os.environ:
         return ALONE
     return Processes(int(os.environ[f"{group}RANK"]), int(os.environ[f"{group}WORLD_SIZE"]))
 
 
 def run(config: TrainerConfig) -> NoReturn:
-    """Start a run's processes with torchrun, wait for them, and exit with their status, or a message where none has
-    printed one."""
+    """Start a run's processes, wait for them, and exit with their status, or a message where none has printed one."""
     from torch.distributed.launcher.api import ChildFailedError, SignalException
     from torch.distributed.run import main as torchrun
 
@@ -55,17 +54,17 @@ def run(config: TrainerConfig) -> NoReturn:
             f"--node-rank K --rdzv-endpoint HOST:PORT --nproc-per-node {count} --no-python ns-train ..."
         )
     os.environ["OMP_NUM_THREADS"] = str(max(1, torch.get_num_threads() // count))
-    os.environ["PYTHONWARNINGS"] = "ignore"  # this process has shown those of nerfstudio's import
-    # after Ctrl-C, the current step and its checkpoint may take longer than torchrun's 30 s
+    os.environ["PYTHONWARNINGS"] = "ignore"  # shown already
+    # a step and its checkpoint may take longer than torchrun's 30 s
     os.environ.setdefault("TORCH_ELASTIC_SHUTDOWN_TIMEOUT", str(round(TIMEOUT.total_seconds())))
-    logging.disable()  # torchrun's log: the processes print their own messages
+    logging.disable()  # torchrun's log
     with tempfile.TemporaryDirectory() as scratch:
         Path(scratch, CONFIG).write_bytes(pickle.dumps(config))
         words = ["--standalone", "--local-addr", "127.0.0.1", "--nproc-per-node", str(count), "--log-dir", scratch]
         try:
             torchrun([*words, "--no-python", *python_command(__name__, "work"), scratch])
         except ChildFailedError as error:
-            soon = error.get_first_failure()[1].timestamp + 1  # later ones were ended by torchrun
+            soon = error.get_first_failure()[1].timestamp + 1  # torchrun ended later ones
             end({rank: each.exitcode for rank, each in error.failures.items() if each.timestamp <= soon}, count)
         except (KeyboardInterrupt, SignalException):
             sys.exit(INTERRUPTED)
@@ -88,7 +87,7 @@ def work() -> None:
     """Train in a process started by `run`."""
     from nerfstudio.scripts.train import train_loop
 
-    tempfile.tempdir = sys.argv[1]  # `run` removes it, whatever ends this process
+    tempfile.tempdir = sys.argv[1]  # which `run` removes
     config = pickle.loads(Path(sys.argv[1], CONFIG).read_bytes())
     try:
         config.set_timestamp()
@@ -113,7 +112,7 @@ def join(config: Any) -> None:
                 for number in (signal.SIGINT, signal.SIGTERM):  # Python's handlers wait for torch, COLMAP's print
                     signal.signal(number, signal.SIG_DFL)
                 vars(config).update(vars(pickle.loads(store.get(CONFIG))))
-                signal.signal(signal.SIGINT, signal.SIG_IGN)  # outside training, the first process handles it
+                signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process handles it
                 vars(config)["scratch"] = scratch = tempfile.TemporaryDirectory()  # kept until the process ends
                 config.output_dir, config.vis = Path(scratch.name), "none"
                 config.pipeline.model.curve_points = 0

@@ -1,4 +1,4 @@
-"""Train in nerfstudio's loop with exact resumption, crash-safe checkpoints and an orderly end on Ctrl-C."""
+"""Train in nerfstudio's loop with exact resumption, whole checkpoints and an orderly end on Ctrl-C."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from torch.cuda.amp.grad_scaler import GradScaler
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # Ctrl-C, a batch system, a terminal that is gone
-AGAIN = 1.0  # seconds within which signals count as one: a batch system's arrives directly and through torchrun
+AGAIN = 1.0  # seconds within which signals are one: torchrun passes on a batch system's
 
 
 class _StopAfterStep(Exception):
@@ -68,31 +68,30 @@ class TogetherOptimizers(Optimizers):
 
 
 class BitymiTrainer(Trainer):
-    """Trainer to a total number of steps, so that resumed runs end like uninterrupted ones. Every process of a run has
-    one; they train in step."""
+    """Trainer to a total number of steps, as of uninterrupted runs. Every process has one; they train in step."""
 
     config: Any  # nerfstudio declares those of every method
     pipeline: Any
 
     def __init__(self, config: TrainerConfig, **alone: Any) -> None:
-        here = torchrun.own("LOCAL_")  # nerfstudio did not start the process and passes rank 0 of 1
+        here = torchrun.own("LOCAL_")  # nerfstudio passes rank 0 of 1
         with print_brackets():
             super().__init__(config, here.rank, here.count)
         self.processes = torchrun.own()
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        self._stop_requested = 0.0  # time.monotonic() of the first signal; 0 = none
+        self._stop_requested = 0.0  # time of the first signal; 0 = none
         try:
             with print_brackets():
                 super().setup(test_mode)
-        except KeyboardInterrupt:  # nerfstudio would print a traceback and report success
+        except KeyboardInterrupt:  # else a traceback and status 0
             CONSOLE.print("[bold yellow]Interrupted before the first step; there is nothing to save.")
             raise SystemExit(INTERRUPTED) from None
         facts = self.pipeline.datamanager.train_dataset.facts
         folder_lock.keep_poses_report(self.base_dir, facts.poses_report, facts.poses_found)
         for line in getattr(self.viewer_state, "viewer_info", []):
             CONSOLE.print(line, soft_wrap=True)
-        # last callback of a step: the complete state can be saved
+        # last callback of a step, where the state is complete
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], self._end_of_step))
 
     def setup_optimizers(self) -> Optimizers:
@@ -141,7 +140,7 @@ class BitymiTrainer(Trainer):
         except ProcessesApart as error:
             fail(f"training cannot go on at step {self.step}: {error}.", error)
         finally:
-            # a GPU that waits for a lost process would block this: it is freed when this process ends
+            # a GPU that waits for a lost process would block this
             if dist.is_initialized() and (orderly or self.config.machine.device_type != "cuda"):
                 dist.destroy_process_group()
             folder_lock.leave(self.base_dir)
@@ -151,14 +150,14 @@ class BitymiTrainer(Trainer):
         if self._start_step >= total:
             warn(f"The checkpoint has {self._start_step:,} of {total:,} steps: give a larger --max-num-iterations.")
             return
-        if self.processes.first:  # of every parameter a checkpoint holds the value and Adam's two moments
+        if self.processes.first:  # a checkpoint has each parameter and Adam's two moments
             learned = [p.nbytes for p in self.pipeline.parameters() if p.requires_grad]
             folder_lock.check_space(self.base_dir, 3 * sum(learned))
         if self._start_step > 0:
             say(f"{self.config.length()}, {total - self._start_step:,} of them left")
         previous = self._catch_interrupt()
         try:
-            # nerfstudio's loop reads its number of steps there, and has no argument for it
+            # nerfstudio's loop reads its length there
             self.config.max_num_iterations = total - self._start_step
             with print_brackets(), step_bar(self._start_step, total) as self._show_step:
                 super().train()
@@ -186,7 +185,7 @@ class BitymiTrainer(Trainer):
             if self.training_state == "completed" or (before and now > before + AGAIN):
                 raise KeyboardInterrupt
             self._stop_requested = before or now
-            if number == signal.SIGINT:  # else of a batch system, or of torchrun after another process has ended
+            if number == signal.SIGINT:  # else of a batch system or torchrun
                 CONSOLE.print("\nStopping after this step and saving a checkpoint; Ctrl-C again stops at once.")
 
         for number in previous:
@@ -212,7 +211,7 @@ class BitymiTrainer(Trainer):
         checkpoints.save(state, path, self.base_dir, self.config.pipeline.model.scene)
         if self.config.save_only_latest_checkpoint:
             for other in self.checkpoint_dir.glob("step-*.ckpt"):
-                if other.name < path.name:  # later ones are of a run that this one branched from
+                if other.name < path.name:  # later ones are of another branch
                     other.unlink(missing_ok=True)
 
 
@@ -221,7 +220,7 @@ class BitymiPipeline(VanillaPipeline):
     model: Any
 
     def __init__(self, *args: Any, world_size: int = 1, local_rank: int = 0, **kwargs: Any) -> None:
-        # without `world_size`, for which nerfstudio would wrap the model in DistributedDataParallel (`torchrun`)
+        # else nerfstudio would wrap the model in DistributedDataParallel
         super().__init__(*args, **kwargs)
         self.datamanager.world_size = world_size
 
@@ -232,11 +231,11 @@ class BitymiPipeline(VanillaPipeline):
     def load_pipeline(self, loaded_state: dict[str, Any], step: int) -> None:
         try:
             super().load_pipeline(loaded_state, step)
-        except (RuntimeError, LookupError, TypeError, AttributeError) as error:  # torch's list of what does not fit
+        except (RuntimeError, LookupError, TypeError, AttributeError) as error:
             if exit_messages.out_of_memory(error):
                 raise
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
-        if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # in training the callbacks do this
+        if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # callbacks do this in training
             return
         state, held_out = self.model.resume_state, to_cameras(self.datamanager.eval_dataset.cameras, "cpu")
         warn_of_other_capture(state.get("capture"), capture_fingerprint(self.datamanager.train_dataset))

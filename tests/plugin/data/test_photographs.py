@@ -49,7 +49,7 @@ def look_at_all(manager: BitymiDataManager, pictures: Any) -> int:
     """Visit all views as training and evaluation do; returns the most pictures alive at once."""
     most = 0
     for step in range(2 * TRAIN):
-        _, batch = manager.next_train(step)
+        _, batch = manager.train_view(manager.train_index(step))
         assert batch["image"].shape == (HEIGHT, WIDTH, 3)
         most = max(most, len(pictures))
     for _, batch in manager.fixed_indices_eval_dataloader:

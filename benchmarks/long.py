@@ -40,7 +40,6 @@ from bitymi_ns.measure.report.tables import quality_markdown
 from bitymi_ns.plugin.run.metrics import image_metrics
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.scene import RenderOutput
 from bitymi_ns.train.evaluate import evaluate
 from bitymi_ns.train.exposure import corrected
 from bitymi_ns.train.fit import Trainer
@@ -166,19 +165,12 @@ def measure(run: LongRun) -> Figures:
     poses, exposure = training.poses, training.exposure
     held_out = [view._replace(correction=exposure.at(view.file)) for view in capture.held_out]
     say(f"{len(scene):,} surfels; evaluating")
-    fragments = []
-
-    def draw(camera: Camera) -> RenderOutput:
-        output = scene.render(camera.to(device), background, "frozen")
-        fragments.append(len(output.fragments) / (camera.width * camera.height))
-        return output
-
-    results = quality(draw, held_out, background)
-    results |= {"fragments_per_pixel": statistics.fmean(fragments), "surfels": len(scene)}
-    aligned = options.align or poses.refined
-    if aligned or exposure.table is not None:
-        judged = evaluate(scene, capture.held_out, preset.train, poses if aligned else None, exposure)
-        results |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "mean_exposure_psnr")}
+    results = quality(lambda camera: scene.render(camera.to(device), background, "frozen"), held_out, background)
+    aligned = poses if options.align or poses.refined else None
+    judged = evaluate(scene, capture.held_out, preset.train, aligned, exposure)
+    pixels = statistics.fmean(view.camera.width * view.camera.height for view in held_out)
+    results |= {"fragments_per_pixel": judged.fragments / pixels, "surfels": len(scene)}
+    results |= {name: getattr(judged, name) for name in ("carried_psnr", "refined_psnr", "mean_exposure_psnr")}
     figures: Figures = {"train": costs | {"steps": run.steps, "rollbacks": training.guard.rollbacks}}
     views = [view._replace(camera=poses.of(i, view.camera)) for i, view in enumerate(capture.train)]
     views = corrected(views, exposure.state_dict(), [view.file for view in views if view.file])

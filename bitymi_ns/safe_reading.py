@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import BufferedReader, TextIOWrapper
 from pathlib import Path
-from typing import Any, NoReturn, TextIO
+from typing import Any, TextIO
 
 from pydantic import ValidationError
 from rich.filesize import decimal
@@ -94,18 +94,17 @@ def why(error: BaseException) -> str:
 @contextmanager
 def reading(
     what: object,
-    refuse: Callable[[str, BaseException], NoReturn],
+    refuse: Callable[[str], BaseException],
     advice: str = "",
     passing: tuple[type[BaseException], ...] = (),
 ) -> Iterator[None]:
     """Convert any exception in the block, which reads untrusted data, to a one-line message of place and cause. `what`:
-    file and entry being read, as in "a.json: frame 3". `refuse`: raises the exception for a message and its cause.
-    `advice`: end of the message: what to do, unless memory ran out. `passing`: exceptions with such a message, which
-    are passed on."""
+    file and entry being read, as in "a.json: frame 3". `refuse`: makes the exception from the message. `advice`: end of
+    the message: what to do, unless memory ran out. `passing`: exceptions that are passed on."""
     try:
         yield
     except passing:
         raise
     except Exception as error:
         then = "End other programs, or make it smaller." if out_of_memory(error) else advice
-        refuse(f"{what} cannot be read: {why(error)}.{' ' + then if then else ''}", error)
+        raise refuse(f"{what} cannot be read: {why(error)}.{' ' + then if then else ''}") from error

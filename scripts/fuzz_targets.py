@@ -25,7 +25,7 @@ from bitymi_ns.capture.types import CaptureError, ColmapCamera, MapFiles
 from bitymi_ns.measure.report.page import compose, to_page
 from bitymi_ns.measure.report.read import collect
 from bitymi_ns.measure.report.records import ReportError
-from bitymi_ns.plugin.console import InputError, fail
+from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.run import checkpoints
 from bitymi_ns.plugin.run.camera_path import read_camera_path
@@ -282,7 +282,7 @@ def archive(work: Path) -> Target:
         path.write_bytes(
             data if data[:1] == b"P" else parts(lambda held, _: {**held, "data.pkl": data}.items())(whole, work)
         )
-        with reading("it", fail), open(path, "rb") as file:
+        with reading("it", InputError), open(path, "rb") as file:
             state = read_archive(file)
         layers = state.get("pipeline") if isinstance(state, dict) else None
         for values in layers.values() if isinstance(layers, dict) else ():

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
-from typing import NoReturn
 from unittest.mock import Mock
 
 import pytest
@@ -87,10 +86,7 @@ def test_commands_of_others_end_in_one_line(error: str, line: str) -> None:
 
 
 def _read(path: Path) -> None:
-    def refuse(line: str, error: BaseException) -> NoReturn:
-        raise ValueError(line) from error
-
-    with reading(path, refuse, "It is damaged."):
+    with reading(path, ValueError, "It is damaged."):
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] DefaultCPUAllocator: can't allocate memory")
 
 

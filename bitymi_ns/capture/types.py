@@ -41,7 +41,7 @@ def parsing(
     what: object, advice: str = "", passing: tuple[type[BaseException], ...] = ()
 ) -> AbstractContextManager[None]:
     """Convert any exception in the block to a CaptureError; see `reading`."""
-    return reading(what, fail, advice, (CaptureError, *passing))
+    return reading(what, CaptureError, advice, (CaptureError, *passing))
 
 
 MAP_FILES = (".png", ".tif", ".tiff", ".npy", ".npz", ".exr")  # extensions of depth and normal maps

@@ -4,7 +4,7 @@ import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.locks import Busy, Lock
@@ -49,7 +49,7 @@ def read_result(work: Path, cell: Cell) -> dict[str, Any]:
     `bytes`, `files`, `format` and `statistics` of the bundle. eval: `results`, means over the held-out views, and the
     folder of their `pictures`."""
     output = work / cell.output
-    with reading(output, _refuse):
+    with reading(output, CommandFailed):
         if cell.cell == "export":
             from bitymi_ns.bundle.read import download_bytes, read_manifest  # imports torch
 
@@ -73,10 +73,6 @@ def read_result(work: Path, cell: Cell) -> dict[str, Any]:
         curve = curves[0]
         figures = {name: curve.last(name) for name in ("seconds", "cpu_seconds", "surfels", "fragments")}
         return {"steps": curve.last("step"), **figures, "curve": (cell.output / CURVE).as_posix()}
-
-
-def _refuse(message: str, cause: BaseException) -> NoReturn:
-    raise CommandFailed(message) from cause
 
 
 def missing(chain: Chain, cells: Cells) -> list[Cell]:

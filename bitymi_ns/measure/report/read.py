@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from bitymi_ns.measure.bench.cells import FILE as CELLS
 from bitymi_ns.measure.bench.cells import NOT_OF_A_RUN, Cells, identity
@@ -18,10 +18,6 @@ MAX_BYTES = 64 << 20  # larger files are not evaluations
 ADVICE = "Write it again, or leave it out."
 
 
-def _refuse(message: str, cause: BaseException) -> NoReturn:
-    raise ReportError(message) from cause
-
-
 def is_evaluation(data: Any) -> bool:
     return isinstance(data, dict) and isinstance(data.get("results"), dict)
 
@@ -29,7 +25,7 @@ def is_evaluation(data: Any) -> bool:
 def read_jsonl(path: Path) -> Records:
     """Read evaluations and the curve of a JSONL file; empty if it holds something else. A truncated last line (of a
     killed run) is skipped with a note. Raises ReportError: another line is broken."""
-    with reading(path, _refuse, ADVICE):
+    with reading(path, ReportError, ADVICE):
         lines = [(i, s) for i, s in enumerate(read_text(path, MAX_BYTES).splitlines(), 1) if s.strip()]
     values, notes = [], []
     for number, line in lines:
@@ -47,7 +43,7 @@ def read_jsonl(path: Path) -> Records:
 def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> None:
     """Add cells of the file `path`, and the curves and images that they name, if these exist. Raises ReportError: a
     cell lacks an entry."""
-    with reading(f"{path}: a cell", _refuse, passing=(ReportError,)):
+    with reading(f"{path}: a cell", ReportError, passing=(ReportError,)):
         runs = grouped(cells, lambda cell: identity(cell["key"], *NOT_OF_A_RUN))
         keys = [of_run[0]["key"] for of_run in runs.values()]
         seeds = Counter(identity(key, *NOT_OF_A_RUN, "seed") for key in keys)
@@ -76,7 +72,7 @@ def _add_run(trained: Evaluation, suffix: str, of_run: list[dict[str, Any]], rec
     for (kind, bundle), value in values.items():
         if kind != "eval":
             continue
-        with reading(f"{trained.source}: the eval cell of {trained.method}", _refuse):
+        with reading(f"{trained.source}: the eval cell of {trained.method}", ReportError):
             size = values.get(("export", bundle), {}).get("bytes")
             results = finite_numbers({**value["results"], **times, "bundle_bytes": size})
             if "psnr" not in results:
@@ -118,7 +114,7 @@ def _read(path: Path) -> Records:
     if path.suffix.lower() == ".jsonl" and path.name != CELLS:
         return read_jsonl(path)
     records = Records()
-    with reading(path, _refuse, ADVICE, passing=(ReportError,)):
+    with reading(path, ReportError, ADVICE, passing=(ReportError,)):
         if path.name == CELLS:
             add_cells(Cells(path).known.values(), path, records)
         elif is_evaluation(data := read_json(path, MAX_BYTES)):

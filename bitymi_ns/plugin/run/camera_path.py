@@ -79,7 +79,7 @@ class CameraPath(BaseModel):
 
 def read_camera_path(file: Path) -> CameraPath:
     """Read a camera path; warn if its fields of view look like radians."""
-    with reading(f"the camera path {file}", fail, f"{HELP} (--camera-path-filename)"):
+    with reading(f"the camera path {file}", InputError, f"{HELP} (--camera-path-filename)"):
         found = read_json(file)
     if isinstance(found, dict) and (found.get("seconds") == 0 or found.get("camera_path") == []):
         fail(f"the camera path {file} has no frames: add a second keyframe, and save it again.")

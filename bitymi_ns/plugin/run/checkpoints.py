@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from bitymi_ns.files import complete_file, reason
-from bitymi_ns.plugin.console import fail, listed, warn
+from bitymi_ns.plugin.console import InputError, fail, listed, warn
 from bitymi_ns.safe_reading import open_regular, reading
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.trust import json_of
@@ -78,9 +78,9 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     way_out = f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
 
     advice = f"It is damaged (cut off or altered), or another program wrote it. {way_out}."
-    with reading(f"the checkpoint {path}", fail, "Have it made readable for you (chmod u+r), or copy it."):
+    with reading(f"the checkpoint {path}", InputError, "Have it made readable for you (chmod u+r), or copy it."):
         file = open_regular(path)
-    with file, reading(f"the checkpoint {path}", fail, advice):
+    with file, reading(f"the checkpoint {path}", InputError, advice):
         state = read_archive(file)
     if not isinstance(state, dict) or not {"step", "pipeline", "optimizers"} <= state.keys():
         fail(f"{path} is not a nerfstudio checkpoint")

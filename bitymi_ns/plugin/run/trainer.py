@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns import exit_messages, files
-from bitymi_ns.plugin.console import INTERRUPTED, fail, say, step_bar, warn
+from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, step_bar, warn
 from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.plugin.hooks import print_brackets
@@ -120,7 +120,7 @@ class BitymiTrainer(Trainer):
     def _restore(self, state: dict[str, Any], path: Path) -> None:
         self._start_step = state["step"] + 1
         self.pipeline.load_pipeline(state["pipeline"], state["step"])
-        with reading(f"{path} cannot be resumed: the state of its optimisers", fail, "Train again."):
+        with reading(f"{path} cannot be resumed: the state of its optimisers", InputError, "Train again."):
             for name, saved in state["optimizers"].items():
                 restore_optimizer(self.optimizers.optimizers[name], Entry(saved, f"optimizers.{name}"))
             if "schedulers" in state and self.config.load_scheduler:

@@ -19,7 +19,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 CARRIED = ("bitymi_ns", "benchmarks", "tests", "method_configs", "pyproject.toml", "csrc", "docs", "README.md")
-NEEDED = ("ispc_texcomp", "pydantic", "flip-evaluator", "torchmetrics", "lightning-utilities", "typing-extensions")
+NEEDED = ("ispc_texcomp", "flip-evaluator", "torchmetrics", "lightning-utilities", "typing-extensions")
 NEEDED += ("wgpu", "cffi", "pycparser", "rendercanvas", "nerfstudio", "tyro", "docstring-parser", "typeguard")
 NEEDED += ("pycolmap", "pillow-heif")
 """Wheels missing on machines with torch and the usual scientific packages, in the versions of constraints.txt."""
@@ -46,12 +46,14 @@ def steps_of(order: str, results: Path, data: Path, surfels: Sequence[str] = (),
     sanitizer = ("compute-sanitizer", "--error-exitcode", "9", "--print-limit", "20", "--tool")
     bundles = results / "bundles"
     if order == "check":
+        kernels = (*times, "kernels", "--device", "cuda")
         large = ("--surfels", "150000", "--size", "1297", "840", "--times", "20")
+        small = ("--surfels", "300", "--size", "96", "64", "--times", "0")
         return [
             Step("block textures", [sys.executable, "-c", BLOCKS], 60),
             Step("tests", [*pytest, "tests/cuda", "-k", "not emulated"], 240),
-            Step("kernels", [*times, "cuda", *large], 90),
-            *(Step(tool, [*sanitizer, tool, *times, "cuda"], 150) for tool in SANITIZERS),
+            Step("kernels", [*kernels, *large], 90),
+            *(Step(tool, [*sanitizer, tool, *kernels, *small], 150) for tool in SANITIZERS),
         ]
     if order == "webgpu":
         return [Step("webgpu tests", [*pytest, "tests/ops/webgpu"], 60)]
@@ -84,10 +86,8 @@ def stage(arguments: argparse.Namespace) -> None:
     wheel = [*pip, "wheel", "-q", "--no-build-isolation", "--no-deps", "-w", str(wheels), str(ROOT)]
     subprocess.run([*wheel, *options], check=True)
     fetched = [*pip, "download", "-q", "--only-binary", ":all:", "-d", str(wheels), "-c", f"{ROOT}/constraints.txt"]
-    for name in NEEDED:
-        if not list(wheels.glob(f"{name.replace('-', '_')}-*.whl")):
-            with_needs = [] if name == "pydantic" else ["--no-deps"]
-            subprocess.run([*fetched, *with_needs, name], check=True)
+    subprocess.run([*fetched, "pydantic"], check=True)  # with its dependencies
+    subprocess.run([*fetched, "--no-deps", *NEEDED], check=True)
     from bitymi_ns.plugin.run import lpips  # lazily: `run` starts without this package
 
     lpips.load("alex")

@@ -7,9 +7,9 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from timeit import timeit
 from typing import Literal
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads OpenMP
@@ -17,7 +17,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # read when torch loads Ope
 import torch
 import tyro
 from scenes import around, textured, trained_like, with_texels
-from torch import Tensor
 from torch.nn.functional import l1_loss
 
 from bitymi_ns import ops
@@ -26,11 +25,9 @@ from bitymi_ns.measure.bench.process import say
 from bitymi_ns.measure.markdown import number, page, publish, table
 from bitymi_ns.ops.backend import emulated_cuda
 from bitymi_ns.ops.baked_renderer import BakedRenderer, Stage
-from bitymi_ns.ops.constants import SUPPORT
-from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.scene.baked import BakedScene
 from bitymi_ns.scene.camera import Camera
-from bitymi_ns.scene.field import HashField, TexelField
+from bitymi_ns.scene.field import TexelField
 
 CPU = torch.device("cpu")
 CLOCK = 2.0e9  # upper bound of GPU clocks, Hz, to convert seconds to cycles of `torch.cuda._sleep`
@@ -44,17 +41,6 @@ def gpu() -> torch.device:
     if not torch.cuda.is_available():
         raise SystemExit("no CUDA device was found (or torch is a CPU build)")
     return torch.device("cuda")
-
-
-def seconds(run: Run, runs: int, warm_up: int = 2) -> tuple[float, float]:
-    """Measure the median wall-clock and CPU seconds of a call on the CPU, after `warm_up` untimed calls."""
-    times = []
-    for _ in range(warm_up + runs):
-        wall, cpu = time.perf_counter(), time.process_time()
-        run()
-        times.append((time.perf_counter() - wall, time.process_time() - cpu))
-    wall, cpu = map(statistics.median, zip(*times[warm_up:], strict=True))
-    return wall, cpu
 
 
 def device_milliseconds(run: Run, runs: int) -> float:
@@ -80,93 +66,6 @@ def device_milliseconds(run: Run, runs: int) -> float:
         torch.cuda.synchronize()
         times.append(begin.elapsed_time(end) / calls)
     return statistics.median(times)
-
-
-def back(outputs: Tensor, inputs: Sequence[Tensor]) -> Run:
-    """Prepare a backward pass on a retained graph, with fixed random gradients."""
-    gradients = torch.randn_like(outputs)
-    return lambda: torch.autograd.grad(outputs, inputs, gradients, retain_graph=True)
-
-
-def cases(n: int, width: int, height: int) -> tuple[str, dict[str, Run]]:
-    """Describe a scene's counts, and prepare its kernels by name."""
-    scene, camera = trained_like(n, width, height, CPU)
-    baked, _ = textured(n, width, height, CPU)
-    q, field, bound = scene.surfels, scene.field, scene.config.weight_bound
-    assert isinstance(field, HashField)
-    geometry = geometry_of(q)
-    project = partial(ops.project, *geometry, camera, scene.near)
-    projection = project()
-    fragments = ops.trace(projection, scene.config.rim)
-    base = scene.base_color(projection)
-    leaf = base.detach().requires_grad_()  # leaves, so that each backward pass runs one kernel
-    residual = partial(ops.fragment_residual, fragments, projection.frames.detach(), field.geometry)
-    fixed = tuple(w.detach() for w in field.weights)
-    listed = residual(fixed, bound).requires_grad_()
-    geom = projection.geom.detach().requires_grad_()
-    weight, uv = (values.detach().requires_grad_() for values in (fragments.weight, fragments.uv))
-    alone = replace(fragments, weight=weight, uv=uv, depth=fragments.depth.detach())
-    blend = partial(ops.blended_image, alone, replace(projection, geom=geom), leaf, bound=bound)
-    side = torch.full((n, 2), 8, dtype=torch.int32)
-    tiles = ops.TexelTiles.of_sizes(side, projection.geom.new_full((n,), SUPPORT))
-    texels = (torch.rand(tiles.count, 3) - 0.5).requires_grad_()
-    photo, other = (torch.rand(height, width, 3) for _ in range(2))
-    other.requires_grad_()
-    view = tuple(q[name] for name in ops.VIEW_COLORS["sv"].names)
-    textured_share = float((fragments.weight >= bound).float().mean())
-    counts = (
-        f"{int(projection.visible.sum()):,} visible, {len(fragments):,} fragments "
-        f"({len(fragments) / (width * height):.1f} per pixel), {100 * textured_share:.0f} % of them textured"
-    )
-    forward = {
-        "project": project,
-        "view colour": partial(scene.base_color, projection),
-        "trace": partial(ops.trace, projection, scene.config.rim),
-        "field": partial(residual, fixed, bound),
-        "blend": blend,
-        "blend, field": partial(blend, residual=listed),
-        "blend, texels": partial(blend, texels, tiles),
-        "baked render, uint8 atlas": partial(baked.render, camera),
-    }
-    backward = {
-        "project backward": back(projection.geom, geometry),
-        "view colour backward": back(base, (q["means"], *view)),
-        "trace backward": back(fragments.weight, (projection.geom,)),
-        "field backward": back(residual(field.weights, bound), field.weights),
-        "blend backward": back(blend(), (weight, geom, leaf)),
-        "blend backward, field": back(blend(residual=listed), (weight, geom, leaf, listed)),
-        "blend backward, texels": back(blend(texels, tiles), (weight, uv, geom, leaf, texels)),
-        "ssim forward + backward": lambda: torch.autograd.grad(ops.ssim(other, photo), other),
-    }
-    return counts, {name: torch.no_grad()(run) for name, run in forward.items()} | backward
-
-
-def kernels(
-    surfels: tuple[int, ...] = (5_000, 20_000),
-    size: tuple[int, int] = (270, 480),
-    runs: int = 9,
-    output: Path | None = None,
-) -> None:
-    """Time each CPU kernel on a scene like a trained one (`scenes.trained_like`): medians after two warm-up runs. The
-    baked scene has a tile per surfel and a texel per pixel.
-
-    Args:
-        surfels: Sizes of the scene.
-        size: Width and height of the image.
-        runs: Timed runs of a kernel.
-        output: Also write the Markdown to this file.
-    """
-    parts, load = [], os.getloadavg()[0]
-    for n in surfels:
-        counts, prepared = cases(n, *size)
-        rows = []
-        for name, run in prepared.items():
-            wall, cpu = seconds(run, runs)
-            say(f"{n:,} surfels, {name}: {1e3 * wall:.2f} ms")
-            rows.append([name, number(1e3 * wall), number(1e3 * cpu)])
-        parts += [f"### {n:,} surfels at {size[0]} x {size[1]}", counts, table(("kernel", "ms", "CPU ms"), rows)]
-    note = f"Median of {runs} runs; {torch.get_num_threads()} threads. Load average at the start: {load:.1f}."
-    publish(page("CPU kernels", "\n\n".join(parts), [note]), output)
 
 
 def frame_row(
@@ -222,7 +121,7 @@ def frames(
         notes = [f"{torch.cuda.get_device_name(device)}, CUDA {torch.version.cuda}: medians, see `--help`."]
 
     def milliseconds(run: Run) -> float:
-        return 1e3 * seconds(run, 1, 0)[0] if emulated else device_milliseconds(run, runs)
+        return 1e3 * timeit(run, number=1) if emulated else device_milliseconds(run, runs)
 
     def make(source: int | Path, width: int, height: int) -> tuple[str, BakedScene, list[Camera]]:
         if isinstance(source, int):
@@ -246,6 +145,8 @@ def frames(
 def baked(n: int, width: int, height: int, device: torch.device) -> Run:
     """Prepare a frame of a baked scene."""
     scene, camera = textured(n, width, height, device)
+    if device.type == "cpu":
+        return torch.profiler.record_function("BakedScene.render")(partial(scene.render, camera))
     renderer = BakedRenderer(scene, width, height)
     renderer.draw([camera])
     return renderer.run
@@ -279,36 +180,41 @@ SECTIONS: dict[Section, Callable[[int, int, int, torch.device], Run]] = {
 }
 
 
-def cuda(
-    surfels: int = 300,
-    size: tuple[int, int] = (96, 64),
+def kernels(
+    device: Literal["cpu", "cuda"] = "cpu",
+    surfels: int = 5_000,
+    size: tuple[int, int] = (270, 480),
     sections: tuple[Section, ...] = tuple(SECTIONS),
-    times: int = 0,
+    times: int = 9,
 ) -> None:
-    """Run the CUDA kernels of the sections once on a small scene, for sanitizers, or print their device times.
+    """Print the time by kernel of frames and training steps, on a scene like a trained one (`scenes.trained_like`).
 
     Args:
+        device: cpu or cuda.
         surfels: Size of the scene.
         size: Width and height of the image.
-        sections: Kernels to run.
-        times: Time by kernel over so many runs.
+        sections: What to run.
+        times: Timed runs, after five untimed ones; 0 = run once, for sanitizers.
     """
-    device = gpu()
-    activities = [torch.profiler.ProfilerActivity.CPU, torch.profiler.ProfilerActivity.CUDA]
-    for name in sections:
-        run = SECTIONS[name](surfels, *size, device)
-        for _ in range(5 if times else 1):
+    place = gpu() if device == "cuda" else CPU
+
+    def repeat(run: Run, count: int) -> None:
+        for _ in range(count):
             run()
-        torch.cuda.synchronize()
+        if device == "cuda":
+            torch.cuda.synchronize()
+
+    for name in sections:
+        run = SECTIONS[name](surfels, *size, place)
+        repeat(run, 5 if times else 1)
         print(f"{name}: done", flush=True)
         if times:
-            with torch.profiler.profile(activities=activities) as profile:
-                for _ in range(times):
-                    run()
-                torch.cuda.synchronize()
+            with torch.profiler.profile() as profile:
+                repeat(run, times)
             print(f"\n{name}, {times} runs:")
-            print(profile.key_averages().table("self_device_time_total", row_limit=45, max_name_column_width=90))
+            by = f"self_{'device' if device == 'cuda' else 'cpu'}_time_total"
+            print(profile.key_averages().table(by, row_limit=45, max_name_column_width=90))
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict({"kernels": kernels, "frames": frames, "cuda": cuda}, description=__doc__)
+    tyro.extras.subcommand_cli_from_dict({"kernels": kernels, "frames": frames}, description=__doc__)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from importlib.util import find_spec
 from typing import TypeVar
 
 import pytest
@@ -16,20 +17,12 @@ def why_not_on_a_card() -> str | None:
     """Explain why tests cannot run on a GPU, None if they can."""
     if not torch.cuda.is_available():
         return "no CUDA device (or torch without CUDA)"
-    try:
-        from bitymi_ns import _cuda  # noqa: F401
-    except ImportError as error:
-        return f"bitymi_ns._cuda is not built: {error}"
-    return None
+    return None if find_spec("bitymi_ns._cuda") else "bitymi_ns._cuda is not built"
 
 
 def why_not_emulated() -> str | None:
     """Explain why tests cannot run in emulation, None if they can."""
-    try:
-        from bitymi_ns import _emulated  # noqa: F401
-    except ImportError:
-        return "built without BITYMI_EMULATED_CUDA"
-    return None
+    return None if find_spec("bitymi_ns._emulated") else "built without BITYMI_EMULATED_CUDA"
 
 
 HERE = torch.device("cpu")

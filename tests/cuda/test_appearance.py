@@ -8,22 +8,11 @@ from bitymi_ns import ops
 from tests.cuda.conftest import in_orders
 from tests.ops.golden import reference_ssim
 from tests.ops.test_kernels import relative
-from tests.ops.test_view_color import reduced_parameters
+from tests.ops.test_view_color import parameters, reduced_parameters
 
 DTYPES = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
 TERMS = {"sv": (7, 3), "sh": (16, 4), "sb": (2, 5), "sg": (2, 3)}
 """Numbers of terms per view colour: one with unrolled kernels, one without."""
-
-
-def parameters(kind: str, terms: int, n: int) -> dict[str, Tensor]:
-    g = torch.Generator().manual_seed(5)
-    shapes = {
-        "sv": {"sv_sites": (terms, 3), "sv_log_tau": (terms,), "sv_rgb": (terms, 3)},
-        "sh": {"sh_dc": (3,), "sh_rest": (terms - 1, 3)},
-        "sb": {"sb_base": (3,), "sb_lobes": (terms, 6)},
-        "sg": {"sg_base": (3,), "sg_lobes": (terms, 7)},
-    }[kind]
-    return {name: torch.randn(n, *shape, generator=g, dtype=torch.float64) for name, shape in shapes.items()}
 
 
 @DTYPES

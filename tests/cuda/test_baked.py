@@ -17,6 +17,7 @@ from bitymi_ns.bake import bake_field, export
 from bitymi_ns.bundle import read as bundle_read
 from bitymi_ns.bundle import read_bundle
 from bitymi_ns.bundle.bake_options import BakeOptions
+from bitymi_ns.measure.stability.scenes import extreme_scenes
 from bitymi_ns.ops import baked_cuda, baked_renderer
 from bitymi_ns.ops.backend import module
 from bitymi_ns.ops.baked import draw
@@ -42,7 +43,7 @@ from tests.cuda.baked_scenes import (
     to_average,
 )
 from tests.cuda.conftest import in_orders
-from tests.ops.golden import SceneCase, atlas_of, extreme_scenes, load_golden, random_scene
+from tests.ops.golden import SceneCase, atlas_of, load_golden, random_scene
 from tests.ops.test_view_color import reduced_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")

@@ -5,8 +5,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.scenes import extreme_scenes
 from tests.cuda.conftest import in_orders
-from tests.ops.golden import SceneCase, extreme_scenes, random_scene
+from tests.ops.golden import SceneCase, random_scene
 from tests.ops.test_blend import View
 from tests.ops.test_kernels import relative
 

@@ -8,10 +8,11 @@ from torch import Tensor
 
 import bitymi_ns
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.scenes import extreme_scenes
 from bitymi_ns.ops import Unlisted
 from bitymi_ns.ops.parameters import GEOMETRY
 from tests.cuda.conftest import HERE, in_orders, only_short_lists
-from tests.ops.golden import SceneCase, camera_of, extreme_scenes, random_scene
+from tests.ops.golden import SceneCase, camera_of, random_scene
 from tests.ops.test_blend import check_golden
 from tests.ops.test_kernels import relative
 from tests.ops.test_texel import SIZES

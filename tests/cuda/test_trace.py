@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.scenes import SV_KEYS, extreme_scenes
 from bitymi_ns.ops import bin_cuda, capacity, trace_cuda
 from bitymi_ns.ops.backend import kernel, workspace
 from bitymi_ns.ops.parameters import GEOMETRY
@@ -19,11 +20,9 @@ from bitymi_ns.scene import Camera
 from tests.cuda.conftest import HERE, in_orders
 from tests.ops.golden import (
     GOLDEN_NAMES,
-    SV_KEYS,
     SceneCase,
     camera_of,
     crossing_scene,
-    extreme_scenes,
     far_floor,
     load_golden,
     random_scene,

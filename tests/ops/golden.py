@@ -1,4 +1,4 @@
-"""Golden renders and their drawing; scenes shared with other code are in bitymi_ns.measure.stability."""
+"""Golden renders and their drawing; other scenes are in bitymi_ns.measure.stability."""
 
 import math
 from collections.abc import Sequence
@@ -10,34 +10,13 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.measure.stability.scenes import SV_KEYS, SceneCase, extreme_scenes, quaternions, random_scene
+from bitymi_ns.measure.stability.scenes import SceneCase, quaternions, random_scene
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import project as reference_project
 from bitymi_ns.ops.reference import trace as reference_trace
 from bitymi_ns.ops.reference.render import texel
 from bitymi_ns.ops.reference.trace import SUPPORT
 from bitymi_ns.scene import Camera
-
-__all__ = [
-    "GOLDEN_NAMES",
-    "SV_KEYS",
-    "Golden",
-    "SceneCase",
-    "camera_of",
-    "composite_colors",
-    "crossing_scene",
-    "dense",
-    "extreme_scenes",
-    "far_floor",
-    "load_golden",
-    "random_scene",
-    "reference",
-    "reference_ssim",
-    "relative",
-    "tiles_reached",
-    "traced",
-    "values_of",
-]
 
 GOLDEN = Path(__file__).resolve().parent.parent / "golden"
 GOLDEN_NAMES = sorted(path.stem for path in GOLDEN.glob("*.npz"))

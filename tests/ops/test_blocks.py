@@ -5,23 +5,11 @@ import torch
 
 from bitymi_ns import ops
 from bitymi_ns.ops import trace_cpu
-from bitymi_ns.ops.backend import function, kernel_class, module
+from bitymi_ns.ops.backend import function, module
 from bitymi_ns.ops.constants import TILE
-from bitymi_ns.ops.fragment_list import empty_ids, empty_list
+from bitymi_ns.ops.fragment_list import empty_ids
 from bitymi_ns.ops.parameters import GEOMETRY
 from tests.ops.golden import camera_of, random_scene
-
-
-def blocks_of(projection: ops.Projection) -> dict[str, torch.Tensor]:
-    """Trace a view: the list and its layout's arrays, by name."""
-    geom = projection.geom
-    tracer = kernel_class("Trace", geom)()
-    n = tracer.run(**projection.view(geom), most=0)
-    found = empty_list(geom, n)
-    starts = {name: torch.empty(tracer.tiles + 1, dtype=torch.int64) for name in ("tile_start", "block_start")}
-    blocks = torch.empty(tracer.blocks, 2, dtype=torch.int32)
-    tracer.copy(**found, **starts, blocks=blocks)
-    return {**found, **starts, "blocks": blocks}
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -33,13 +21,14 @@ def test_blocks_have_the_surfels_and_pixels_of_the_fragments(
     camera = camera_of(case, dtype)
     case.params["log_scales"][::3, 0] -= 3  # long and thin
     projection = ops.project(*(case.params[key].to(dtype) for key in GEOMETRY), camera)
-    found = blocks_of(projection)
+    fragments = ops.trace(projection)
+    listed = fragments.layout.arrays
     across = -(-width // TILE)
     surfel, pixel, blocks_before = [], [], set()
-    for tile, (first, last) in enumerate(zip(found["block_start"][:-1], found["block_start"][1:], strict=True)):
-        assert len(surfel) == found["tile_start"][tile]
+    for tile, (first, last) in enumerate(zip(listed["block_start"][:-1], listed["block_start"][1:], strict=True)):
+        assert len(surfel) == listed["tile_start"][tile]
         blocks_before.clear()
-        for code, owner in found["blocks"][first:last].tolist():
+        for code, owner in listed["blocks"][first:last].tolist():
             lanes, block = code & 0xFFFF, code >> 16
             assert lanes and 0 <= block < 16 and (owner, block) not in blocks_before
             blocks_before.add((owner, block))
@@ -51,15 +40,11 @@ def test_blocks_have_the_surfels_and_pixels_of_the_fragments(
                 assert x < width and y < height
                 surfel.append(owner)
                 pixel.append(y * width + x)
-        owners = [owner for _, owner in found["blocks"][first:last].tolist()]
+        owners = [owner for _, owner in listed["blocks"][first:last].tolist()]
         runs = [owner for k, owner in enumerate(owners) if k == 0 or owners[k - 1] != owner]
         assert len(runs) == len(set(runs))
-    assert len(surfel) == found["tile_start"][-1] > 0
-    fragments = ops.trace(projection)
+    assert len(surfel) == listed["tile_start"][-1] == len(fragments) > 0
     assert surfel == fragments.surfel.tolist() and pixel == fragments.pixel.tolist()
-    for name in ("weight", "uv", "depth", "sigma"):
-        assert torch.equal(getattr(fragments, name), found[name])
-    assert torch.equal(fragments.layout.arrays["tile_start"], found["tile_start"])
 
 
 def test_places_are_listed_when_they_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
+from bitymi_ns.measure.stability.scenes import SV_KEYS
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference import field as reference_field
@@ -18,7 +19,6 @@ from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import front, textured
 from tests.ops.golden import (
     GOLDEN_NAMES,
-    SV_KEYS,
     SceneCase,
     atlas_of,
     camera_of,

@@ -6,11 +6,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from bitymi_ns.measure.stability.scenes import SV_KEYS, extreme_scenes
 from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.ops.reference.project import project
 from bitymi_ns.ops.reference.render import Render, render
 from bitymi_ns.ops.reference.view_color import sv, view_directions
-from tests.ops.golden import GOLDEN_NAMES, SV_KEYS, SceneCase, extreme_scenes, load_golden, random_scene
+from tests.ops.golden import GOLDEN_NAMES, SceneCase, load_golden, random_scene
 
 IMAGES = ("rgb", "alpha", "depth", "beta_map")
 EXTREME = {case.name: case for case in extreme_scenes()}

@@ -8,7 +8,9 @@ import pytest
 
 pytest.importorskip("bitymi_ns._cpu")
 
+pytestmark = pytest.mark.slow
 spinning = pytest.mark.skipif(os.cpu_count() == 1, reason="one processor: there are no other threads")
+counted = pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
 
 SCRIPT = """
 import time, torch
@@ -53,53 +55,43 @@ def printed(script: str, **environment: str) -> list[float]:
     return [float(word) for word in done.stdout.split()]
 
 
-def processor_time(**environment: str) -> tuple[float, float]:
-    """Measure the CPU seconds of idling in a new process, before and after kernels are set up."""
-    before, after = printed(SCRIPT, **environment)
-    return before, after
-
-
-@pytest.mark.slow
 @spinning
-@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
+@counted
 def test_the_import_starts_no_threads() -> None:
     before, imported, ready = printed(IMPORT)
     assert imported == before
     assert ready > imported  # the first kernel does
 
 
-@pytest.mark.slow
 @spinning
-@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted under /proc")
+@counted
 def test_a_process_of_one_thread_stays_one() -> None:
     """Otherwise many such processes on a large machine would have thousands of threads."""
     _, imported, ready = printed(IMPORT, OMP_NUM_THREADS="1")
     assert ready == imported
 
 
-@pytest.mark.slow
 @spinning
 def test_threads_do_not_spin_once_the_kernels_are_ready() -> None:
-    before, after = processor_time()
+    before, after = printed(SCRIPT)
     if before < 0.1:
         pytest.skip("this OpenMP does not spin")
     assert after < 0.5 * before
 
 
-@pytest.mark.slow
 @spinning
 def test_the_users_own_choice_stands() -> None:
     # other programs take processors from spinning threads and give them none: the largest values are the true ones
-    rounds = [processor_time(GOMP_SPINCOUNT="300000") for _ in range(3)]
+    rounds = [printed(SCRIPT, GOMP_SPINCOUNT="300000") for _ in range(3)]
     before, after = map(max, zip(*rounds, strict=True))
     if before < 0.1:
         pytest.skip("this OpenMP does not spin")
     assert after > 0.3 * before
 
 
-FAILS = """
-import resource, torch
-from bitymi_ns.ops import project, trace
+VIEW = """
+import torch
+from bitymi_ns.ops import TooManyFragments, project, trace
 from bitymi_ns.scene import Camera
 
 def view(size):
@@ -111,6 +103,9 @@ means = torch.zeros(N, 3)
 means[:, 2] = torch.linspace(3, 4, N)
 surfels = (means, torch.tensor([1.0, 0, 0, 0]).repeat(N, 1), torch.full((N, 2), 2.0), torch.full((N,), -3.0),
            torch.zeros(N))
+"""
+FAILS = """
+import resource
 small = view(64)
 trace(small)
 large = view(1024)
@@ -154,15 +149,13 @@ print(*(int(abs(each / want - 1) < 1e-5) for each in (got, *loaded)))
 """
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="limits its address space")
 @pytest.mark.skipif("BITYMI_SANITIZED" in os.environ, reason="the sanitizer ends the process")
 @pytest.mark.parametrize("threads", ["1", "2"])
 def test_a_kernel_without_memory_raises_and_releases_its_threads(threads: str) -> None:
-    assert printed(FAILS, OMP_NUM_THREADS=threads) == [3, 1]
+    assert printed(VIEW + FAILS, OMP_NUM_THREADS=threads) == [3, 1]
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork")
 def test_forked_processes_draw_with_one_thread() -> None:
     assert printed(FORKED, OMP_NUM_THREADS="2") == [1, 1, 1]

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bitymi_ns.codec.bc7_encode import bc7_encoder
+from bitymi_ns.measure.stability.scenes import extreme_scenes
 from bitymi_ns.ops import webgpu
 from bitymi_ns.ops.baked import draw
 from bitymi_ns.ops.baked_cpu import draw as draw_on_cpu
@@ -26,7 +27,7 @@ from bitymi_ns.ops.webgpu import device, on_device
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
 from tests.cuda.baked_scenes import FAR, camera_of, front, layered, scene_of, textured, to_average
-from tests.ops.golden import GOLDEN_NAMES, SceneCase, atlas_of, crossing_scene, extreme_scenes, load_golden, reference
+from tests.ops.golden import GOLDEN_NAMES, SceneCase, atlas_of, crossing_scene, load_golden, reference
 from tests.ops.test_view_color import reduced_parameters
 
 FIELDS = ("rgb", "alpha", "beta", "depth", "normal", "overdraw")

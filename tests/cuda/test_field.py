@@ -5,10 +5,9 @@ import torch
 from torch import Tensor
 
 from bitymi_ns import ops
-from bitymi_ns.ops.parameters import GEOMETRY
-from bitymi_ns.scene import Camera, HashField
+from bitymi_ns.scene import HashField
 from tests.cuda.conftest import HERE, in_orders
-from tests.ops.golden import random_scene
+from tests.ops.golden import random_scene, traced, values_of
 from tests.ops.test_kernels import make_field, relative
 
 
@@ -64,10 +63,8 @@ class Shading:
     def run(self, device: torch.device, mode: str, bound: float = 0.05) -> list[Tensor]:
         """Compute the image, and the gradients of base colours, frames, uv, table and weights that the mode has."""
         case = self.case
-        camera = Camera(case.viewmat.to(self.dtype), case.K.to(self.dtype), case.width, case.height)
         with torch.no_grad():
-            projection = ops.project(*(case.params[key].to(device, self.dtype) for key in GEOMETRY), camera)
-            fragments = ops.trace(projection)
+            fragments, projection = traced(case, values_of(case, self.dtype, device))
         leaves = [t.to(device).clone().requires_grad_() for t in (self.base, projection.frames)]
         fragments.uv.requires_grad_()
         params = [w.detach().to(device).requires_grad_(mode in ("learn", "move")) for w in self.field.weights]

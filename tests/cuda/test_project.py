@@ -5,17 +5,15 @@ import torch
 
 from bitymi_ns.ops import project
 from bitymi_ns.scene import Camera
-from tests.ops.golden import GOLDEN_NAMES, load_golden
+from tests.ops.golden import GOLDEN_NAMES, camera_of, load_golden, values_of
 
-NAMES = ("means", "quats", "log_scales", "opacity_logits", "beta_raw")
 RADII = 2  # index in the result of `run`
 
 
 def run(case, dtype: torch.dtype, device: torch.device):
     """Compute geom, frames, radii and the parameters' gradients for a fixed random direction."""
-    params = [case.params[name].to(device, dtype).requires_grad_() for name in NAMES]
-    camera = Camera(case.viewmat.to(dtype), case.K.to(dtype), case.width, case.height)
-    p = project(*params, camera, 0.2)
+    params = values_of(case, dtype, device, grad=True)
+    p = project(*params, camera_of(case, dtype), 0.2)
     generator = torch.Generator().manual_seed(3)
     directions = [torch.randn(t.shape, generator=generator, dtype=torch.float64) for t in (p.geom, p.frames)]
     loss = sum((t * d.to(t)).sum() for t, d in zip((p.geom, p.frames), directions, strict=True))
@@ -33,9 +31,7 @@ def test_projection_and_its_gradients(name: str, dtype: torch.dtype, device: tor
     tolerance = 1e-10 if dtype == torch.float64 else 1e-4
     for i, (a, b) in enumerate(zip(got, want, strict=True)):
         assert torch.isfinite(a).all()
-        if (
-            i == RADII
-        ):  # half extents of the level set, from planes in single precision here, from a conic in double there
+        if i == RADII:  # from planes in single precision here, from a conic in double there
             # ends far outside the image, near the camera's plane, are sensitive to rounding
             a, b = (t.clamp(max=8.0 * max(case.width, case.height)) for t in (a, b))
             wider, narrower = (a - b - 1e-3 * b).max(), (b - a - 1e-3 * b).max()

@@ -10,8 +10,16 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.parameters import GEOMETRY
-from tests.ops.golden import SceneCase, camera_of, composite_colors, load_golden, random_scene, reference_colors
-from tests.ops.test_texel import SIZES
+from tests.ops.golden import (
+    SceneCase,
+    camera_of,
+    composite_colors,
+    load_golden,
+    random_scene,
+    reference_colors,
+    values_of,
+)
+from tests.ops.test_texel import textures
 
 BOUND = 0.03
 
@@ -25,25 +33,15 @@ class View:
         dtype: torch.dtype,
         textured: bool,
         learns: bool = True,
-        device: torch.device | None = None,
+        device: torch.device | str = "cpu",
         bound: float = BOUND,
     ) -> None:
-        n = len(case.params["means"])
-        g = torch.Generator().manual_seed(n)
-
-        def uniform(low: float, high: float, *shape: int) -> Tensor:
-            return (torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low).to(device, dtype)
-
         self.camera, self.bound = camera_of(case, dtype), bound
-        self.leaves = [case.params[key].to(device, dtype).clone().requires_grad_() for key in GEOMETRY]
-        self.base = uniform(-0.9, 0.5, n, 3).requires_grad_()
-        self.leaves.append(self.base)
+        self.base, texels, tiles = textures(len(case.params["means"]), dtype, device)
+        self.leaves = [*values_of(case, dtype, device, grad=True), self.base.requires_grad_()]
         self.given: dict[str, Tensor | ops.TexelTiles] = {}
         if textured:
-            size = torch.tensor(SIZES, dtype=torch.int32, device=device).repeat(n // len(SIZES) + 1, 1)[:n]
-            tiles = ops.TexelTiles.of_sizes(size, uniform(1.0, 3.0, n))
-            texels = uniform(-0.6, 0.6, tiles.count, 3).requires_grad_(learns)
-            self.given = {"texels": texels, "tiles": tiles}
+            self.given = {"texels": texels.requires_grad_(learns), "tiles": tiles}
             if learns:
                 self.leaves.append(texels)
 

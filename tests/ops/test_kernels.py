@@ -122,35 +122,6 @@ def test_texels_of_bytes_are_those_of_floats() -> None:
     torch.testing.assert_close(scene.render(front()).rgb, whole.render(front()).rgb, atol=1e-5, rtol=0)
 
 
-def test_every_tile_has_its_own_extent() -> None:
-    """Texels linear in u and v: smaller tiles agree between their outer texel centres."""
-    params = {
-        "means": torch.tensor([[0.0, 0.0, 4.0]]),
-        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        "log_scales": torch.zeros(1, 2),
-        "opacity_logits": torch.tensor([4.0]),
-        "beta_raw": torch.tensor([-2.0]),
-        "sv_sites": torch.ones(1, 1, 3),
-        "sv_log_tau": torch.zeros(1, 1),
-        "sv_rgb": torch.zeros(1, 1, 3),
-    }
-    camera = Camera(torch.eye(4), torch.tensor([[40.0, 0, 32], [0, 40.0, 24], [0, 0, 1]]), 64, 48)
-    tiles = torch.tensor([[0, 0, 0, 8, 4]], dtype=torch.int32)
-
-    def render(extent: float) -> Tensor:
-        u, v = ((torch.arange(r) + 0.5) / r * 2 * extent - extent for r in (8, 4))
-        atlas = torch.zeros(1, 4, 8, 4)
-        atlas[0, ..., 0], atlas[0, ..., 1] = 0.1 * u[None, :], 0.1 * v[:, None]
-        return BakedScene(params, "sv", tiles, atlas, extent=torch.tensor([extent])).render(camera).rgb
-
-    u = (torch.arange(64) + 0.5 - 32) / 10  # 40 pixels a unit at depth 4
-    v = (torch.arange(48) + 0.5 - 24) / 10
-    inner = (v.abs()[:, None] < 1.5 * 3 / 4) & (u.abs()[None, :] < 1.5 * 7 / 8)
-    full, small = render(3.0), render(1.5)
-    torch.testing.assert_close(small[inner], full[inner], atol=1e-6, rtol=0)
-    assert (small - full)[~inner].abs().max() > 0.01
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_random_scenes_in_single_precision(seed: int) -> None:
     case = random_scene(80, seed, width=70, height=50)

@@ -12,22 +12,23 @@ from torch import Tensor
 from bitymi_ns import ops
 from bitymi_ns.ops import backend
 from bitymi_ns.ops.backend import cuda_backend
-from bitymi_ns.ops.parameters import GEOMETRY
 from bitymi_ns.scene import Camera
 from bitymi_ns.scene.baked import BakedScene
-from tests.ops.golden import SceneCase, random_scene
+from tests.ops.golden import random_scene, traced, values_of
 
 SIZES = [(4, 8), (1, 1), (8, 4), (0, 0), (4, 4), (16, 4)]
 
 
-def listed(
-    case: SceneCase, dtype: torch.dtype, device: torch.device | str = "cpu"
-) -> tuple[ops.Fragments, ops.Projection]:
-    """Trace a scene: fragments and projection."""
-    camera = Camera(case.viewmat.to(device, dtype), case.K.to(device, dtype), case.width, case.height)
-    with torch.no_grad():
-        projection = ops.project(*(case.params[key].to(device, dtype) for key in GEOMETRY), camera)
-        return ops.trace(projection), projection
+def textures(n: int, dtype: torch.dtype, device: torch.device | str) -> tuple[Tensor, Tensor, ops.TexelTiles]:
+    """Make base colours, texels, and tiles of several sizes and extents."""
+    g = torch.Generator().manual_seed(n)
+
+    def uniform(low: float, high: float, *shape: int) -> Tensor:
+        return (torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low).to(device, dtype)
+
+    size = torch.tensor(SIZES, dtype=torch.int32, device=device).repeat(n // len(SIZES) + 1, 1)[:n]
+    tiles = ops.TexelTiles.of_sizes(size, uniform(1.0, 3.0, n))
+    return uniform(-0.9, 0.5, n, 3), uniform(-0.6, 0.6, tiles.count, 3), tiles
 
 
 class Case:
@@ -38,21 +39,12 @@ class Case:
         n: int = 30,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
-        scene: SceneCase | None = None,
         **options: int | float,
     ) -> None:
-        g = torch.Generator().manual_seed(n)
-
-        def uniform(low: float, high: float, *shape: int) -> Tensor:
-            return (torch.rand(*shape, generator=g, dtype=torch.float64) * (high - low) + low).to(device, dtype)
-
-        scene = scene or random_scene(n, n, **{"width": 40, "height": 30, **options})
-        n = len(scene.params["means"])
-        self.fragments, self.projection = listed(scene, dtype, device)
-        size = torch.tensor(SIZES, dtype=torch.int32, device=device).repeat(n // len(SIZES) + 1, 1)[:n]
-        self.tiles = ops.TexelTiles.of_sizes(size, uniform(1.0, 3.0, n))
-        self.base = uniform(-0.9, 0.5, n, 3)
-        self.texels = uniform(-0.6, 0.6, self.tiles.count, 3)
+        scene = random_scene(n, n, **{"width": 40, "height": 30, **options})
+        with torch.no_grad():
+            self.fragments, self.projection = traced(scene, values_of(scene, dtype, device))
+        self.base, self.texels, self.tiles = textures(n, dtype, device)
 
     def image(self, base: Tensor, texels: Tensor, fragments: ops.Fragments | None = None, **options) -> Tensor:
         """Render [H W, 3]."""
@@ -141,7 +133,7 @@ def test_it_is_what_the_baked_renderer_shows() -> None:
     base = ops.view_color("sv", case.params, case.params["means"], camera.center)
     texels = atlas[0, :, :, :3].view(16, 60, 8, 3).transpose(0, 1).reshape(-1, 3).double()
     table = ops.TexelTiles.of_sizes(tiles[:, 3:], extent.double())
-    image = ops.blended_image(*listed(case, torch.float64), base, texels, table, float(torch.tensor(0.03)))[:, :3]
+    image = ops.blended_image(*traced(case, values_of(case)), base, texels, table, float(torch.tensor(0.03)))[:, :3]
     torch.testing.assert_close(image.view_as(baked.rgb), baked.rgb, rtol=1e-7, atol=1e-7)
 
 

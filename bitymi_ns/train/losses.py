@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import RenderOutput
 
 DEPTH_EDGE = 0.1
-"""Relative depth difference between neighbouring pixels that counts as an edge. Photographs blend both sides of it,
-depth maps do not, and depth sensors are least reliable there."""
+"""Relative depth difference between neighbouring pixels that counts as an edge: photographs blend both sides, depth
+maps do not, and depth sensors are least reliable there."""
 SAME_COLOR = 0.01  # ridge of colour fits: keeps the contrast of colours with a smaller standard deviation
 FITTED = 0.01  # minimum fraction of a half's pixels for a colour fit
-SSIM_WINDOW = 11  # side of the SSIM window in pixels; narrower images have no valid window
+SSIM_WINDOW = 11  # side of the SSIM window, pixels
 
 
 def objective(
@@ -36,16 +36,16 @@ def objective(
     depth: Tensor | None = None,
     normal: Tensor | None = None,
 ) -> dict[str, Tensor]:
-    """Compute the weighted terms of the objective, which is their sum, on every device and however the view was drawn.
+    """Compute the weighted terms of the objective, which is their sum.
 
     Args:
-        output: rendered view of H x W pixels; with `soft_overdraw` if the overdraw loss is on.
-        target: [H, W, 3] photograph at the same size, over the same background.
-        depth, normal: maps as in `View`; used if the view was rendered with maps.
+        output: rendered view of H x W pixels.
+        target: [H, W, 3] photograph over the same background.
+        depth, normal: as in `View`.
 
     Returns:
-        `photometric`; `falloff` unless its weight is 0; `overdraw` if the view was rendered with `soft_overdraw`;
-        `depth` and `normal` if used and their weights are not 0.
+        `photometric`; `falloff`, `depth` and `normal` unless their weight is 0, the latter if the view was rendered
+        with maps; `overdraw` if it was rendered with `soft_overdraw`.
     """
     if isinstance(output, ComparedView):
         terms = {"photometric": output.photometric, "falloff": output.falloff}
@@ -83,9 +83,9 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
 
     Args:
         rgb: [H, W, 3] rendered image.
-        target: [H, W, 3] photograph in [0, 1].
-        ssim_weight: w; 0 for images too small for an 11 x 11 window.
-        mask: other pixels are excluded from L1 and made equal in both images for SSIM: they have no gradient.
+        target: [H, W, 3] photograph.
+        ssim_weight: w; 0 for images smaller than `SSIM_WINDOW`.
+        mask: excluded pixels are left out of L1 and equal in both images for SSIM: they have no gradient.
 
     Returns:
         Scalar; 0 if no pixel counts.
@@ -104,26 +104,20 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
 
 
 def error_weight(rgb: Tensor, target: Tensor, gamma: float, mask: Tensor | None = None) -> Tensor:
-    """Compute omega = exp(-gamma e) of the falloff loss, [H, W, 1], with e = L1 summed over rgb [H, W, 3]: near 1 where
-    the image is right, near 0 where it is wrong, 0 where the mask is False.
-
-    Without gradient: else a larger error would lower the loss.
-    """
+    """Compute omega = exp(-gamma e) of the falloff loss, [H, W, 1], with e = L1 summed over rgb [H, W, 3]; 0 where the
+    mask is False. Without gradient: else a larger error would lower the loss."""
     omega = torch.exp(-gamma * (rgb.detach() - target.detach()).abs().sum(-1, keepdim=True))
     # where() also keeps a NaN in an excluded pixel of the photograph out
     return omega if mask is None else torch.where(mask.reshape(omega.shape), omega, 0.0)
 
 
 def mean_where_right(omega: Tensor, values: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Average omega * values over the pixels: the falloff loss of a beta map, or the overdraw loss of a soft count.
+    """Average omega * values over the pixels that count; 0 without any: the falloff loss of `RenderOutput.beta`, sum_i
+    w_i beta_i, or the overdraw loss of `RenderOutput.soft_overdraw`.
 
     Args:
-        omega: [H, W, 1] from `error_weight`, with the same mask.
-        values: [H, W, 1]. Falloff: `RenderOutput.beta`, sum_i w_i beta_i, which carries gradient to the blending
-            weights and to beta. Overdraw: `RenderOutput.soft_overdraw`, see `ops.soft_overdraw`.
-
-    Returns:
-        Scalar; 0 if no pixel counts.
+        omega: [H, W, 1] of `error_weight`, with the same mask.
+        values: [H, W, 1].
     """
     return (omega * values).sum() / (omega.numel() if mask is None else mask.sum().clamp(min=1))
 
@@ -134,7 +128,7 @@ def depth_error(rendered: Tensor, alpha: Tensor, depth: Tensor, mask: Tensor | N
     Args:
         rendered: [H, W, 1] sum of w z, camera z.
         alpha: [H, W, 1] sum of w.
-        depth: [H, W] or [H, W, 1] d; any float dtype. Unknown where not finite or not above 0.
+        depth: [H, W] or [H, W, 1] d; unknown where not finite or not above 0.
 
     Returns:
         Scalar; 0 if no depth is known.
@@ -161,7 +155,7 @@ def normal_error(rendered: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor |
     Args:
         rendered: [H, W, 3] sum of w n, camera frame.
         alpha: [H, W, 1] sum of w.
-        normal: [H, W, 3] n in the same frame; any float dtype. Unknown where not finite or 0.
+        normal: [H, W, 3] n in the same frame; unknown where not finite or 0.
 
     Returns:
         Scalar; 0 if no normal is known.
@@ -174,7 +168,7 @@ def normal_error(rendered: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor |
 
 
 def _mean_of(values: Tensor, known: Tensor, mask: Tensor | None) -> Tensor:
-    """Average over the known pixels that count; 0 if there is none."""
+    """Average over the known pixels that count; 0 without any."""
     if mask is not None:
         known = known & mask.reshape(known.shape)
     return torch.where(known, values, 0.0).sum() / known.sum().clamp(min=1)
@@ -192,18 +186,17 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Map the colours of each half of an image by an affine fit on the other half, clamped to [0, 1]: [H, W, 3].
+    """Map the colours of each half of an image by the affine least squares fit of the other half to `target`, clamped
+    to [0, 1]: [H, W, 3]. Compensates exposure and white balance of held-out photographs.
 
-    Compensates exposure and white balance of held-out photographs: matrix [3, 3] and offset [3] are the least squares
-    fit to `target` over the unmasked pixels of the other half. A half is not mapped if the other half is not finite, or
-    if the fraction of the other half's pixels that count is below `FITTED`. `image` and `target`: [H, W, 3] in
-    [0, 1]."""
+    A half is not mapped if the other one is not finite, or has fewer pixels that count than `FITTED`. `image`,
+    `target`: [H, W, 3] in [0, 1]."""
     colors = torch.cat([image, torch.ones_like(image[..., :1])], -1).double()  # [H, W, 4]
     both = torch.cat([colors, target - image], -1)  # [H, W, 7] double
     if mask is not None:
         both = torch.where(mask.reshape(*image.shape[:2], 1).bool(), both, 0.0)
     left, right = slice(image.shape[1] // 2), slice(image.shape[1] // 2, None)
-    # normal equations; no matrix product: cuBLAS fails if torch is set to deterministic algorithms
+    # normal equations without matrix product: cuBLAS fails if torch is set to deterministic algorithms
     sums = [[(both[:, by, i : i + 1] * both[:, by]).sum((0, 1)) for i in range(4)] for by in (right, left)]
     sums = torch.stack([torch.stack(rows) for rows in sums]).cpu()  # [2, 4, 7]
     fitted = []
@@ -219,11 +212,11 @@ def color_fitted(image: Tensor, target: Tensor, mask: Tensor | None = None) -> T
 
 
 def fitted_psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Compute the PSNR of the `color_fitted` image, which does not depend on exposure and white balance."""
+    """Compute the PSNR, dB, of the `color_fitted` image."""
     return psnr(color_fitted(image, target, mask), target, mask)
 
 
 def mean_psnr(values: Sequence[float]) -> float:
-    """Average PSNR values, dB, without NaN (views without unmasked pixels); NaN if empty."""
+    """Average PSNR values, dB, without NaN; NaN if empty."""
     counted = [value for value in values if not math.isnan(value)]
     return sum(counted) / len(counted) if counted else math.nan

@@ -1,4 +1,4 @@
-"""The training step, shared by `fit` and nerfstudio's training loop."""
+"""The training step of `fit` and of nerfstudio's training loop."""
 
 from __future__ import annotations
 
@@ -48,16 +48,16 @@ if TYPE_CHECKING:
     from bitymi_ns.ops.project import Projection
     from bitymi_ns.scene.scene import Scene
 
-DROPOUT_NUMBERS = 1 << 30  # number of the first step's dropout; below are those of backgrounds and of the views' order
+DROPOUT_NUMBERS = 1 << 30  # random number of the first step's dropout; below are those of backgrounds and view order
 TIMED_VIEWS = 3  # views that tell what a step takes at another size
 
 
 def with_dropout(opacity_logits: Tensor, probability: float, seed: int, step: int) -> Tensor:
-    """Leave out surfels of a view at random, as dropout does with the units of a network (Srivastava et al. 2014).
+    """Leave out surfels of a view at random, as dropout does with the units of a network (Srivastava et al. 2014): [N]
+    logits to draw the view with.
 
-    The odds of the others' opacities are divided by 1 - p, which for small opacities preserves the expected one. Those
-    left out are not drawn and have no gradient. The choice depends on `seed`, `step` and the kind of device. Returns
-    [N] logits to draw the view with. `probability`: p, from 0 to below 1."""
+    The odds of the others' opacities are divided by 1 - `probability`, which for small opacities preserves the expected
+    one. Those left out have no gradient. The choice depends on `seed`, `step` and the kind of device."""
     numbers = random_numbers(seed, DROPOUT_NUMBERS + step, opacity_logits.device)
     left_out = torch.rand(opacity_logits.shape, generator=numbers, device=opacity_logits.device) < probability
     return torch.where(left_out, -SHAPE_LIMIT, opacity_logits - math.log1p(-probability))
@@ -73,17 +73,17 @@ def view_losses(
     descent: TexelDescent | None = None,
     dropout: float = 0.0,
 ) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
-    """Render a training view and compare it with its photograph, as the options ask in this step of the schedule.
+    """Render a training view and compare it with its photograph, by the schedule.
 
     Args:
         view: on the scene's device, with its image at its camera's size.
-        background: [3] colour behind the scene, where it is constant over steps; None: as the options say.
+        background: [3] colour behind the scene, where it is constant over steps; None: by the options.
         descent: see `Scene.render`.
         dropout: probability with which a surfel is left out.
 
     Returns:
-        The weighted loss terms (their sum is the objective) and the rendered view: a `ComparedView` without image if
-        one CUDA function does both.
+        The weighted loss terms (`objective`) and the rendered view: a `ComparedView` without image if one CUDA function
+        does both.
 
     Raises:
         TrainingDiverged: the loss is not finite.
@@ -115,15 +115,14 @@ class Training:
 
     `begin` -> zero the gradients -> `losses` -> backward of their sum -> `combine` -> optimisers -> `finish`.
 
-    With several processes, a step minimises the mean loss over the views of all processes. Every process makes the
-    same calls at the same steps; it calls `losses` and backward once for each of its own views.
+    A step minimises the mean loss over the views of all processes. Each makes the same calls at the same steps,
+    `losses` and backward once for each of its own views.
 
     Attributes:
         step: index of the current step.
-        exposure: colour corrections of the training photographs; decided when the first step begins.
-        poses: pose corrections of the training photographs.
+        exposure, poses: corrections of the training photographs.
         clock: time spent between `begin` and `finish`.
-        background: [3] colour behind the scene, where it is constant over steps; None: as the options say.
+        background: as in `view_losses`.
     """
 
     def __init__(
@@ -140,10 +139,9 @@ class Training:
         """
         Args:
             scene: changed in place.
-            optimizers: by surfel parameter name, and `field_table` and `field_mlp` for a hash field.
-            max_steps: length of the run; the schedules depend on it.
-            on_resize: called with the name and the new Parameter when a surfel parameter is replaced.
-            announce: called with a sentence on each rollback and whenever surfels are dropped.
+            optimizers: as of `make_optimizers`.
+            max_steps: length of the run.
+            announce: called with a sentence on rollbacks, dropped surfels and limits of memory.
 
         Raises:
             ValueError: a training option is out of its range.
@@ -171,18 +169,17 @@ class Training:
 
     @functools.cached_property
     def views(self) -> DownscaledViews:
-        """Training views. Created at first use, because their cache takes a share of the GPU memory free then."""
+        """Training views, created at first use, as their cache takes a share of the free GPU memory."""
         return DownscaledViews(self._full_size, self.scene.surfels["means"].device, self.exposure.of, self.poses.of)
 
     def view(self, index: int) -> View:
-        """Return training view `index` on the device, at the resolution and pose of the current step."""
+        """Return training view `index` at the resolution and pose of the current step."""
         view = self.views.at(index, self.schedule.resolution_factor(self.step))
         correction = self.exposure.learning(index, view.correction)
         return view._replace(camera=self.poses.learning(index, view.camera, self.step), correction=correction)
 
     def begin(self, step: int) -> None:
-        """Start a step and its clock, with the exposure corrections or the texel stage if they are due, and set the
-        learning rates."""
+        """Start a step and its clock, the exposure corrections or the texel stage if due, and set the rates."""
         if not self._synchronised:  # before the clock starts: waiting for other processes is no training time
             self.processes.broadcast_(self.scene.state_dict().values())
         self.clock.start()
@@ -211,8 +208,8 @@ class Training:
             set_rate(optimizer, self.guard.factor * self.step_sizes.rate(name, self.step))
 
     def losses(self, view: View) -> tuple[dict[str, Tensor], RenderOutput | ComparedView]:
-        """Compute `view_losses`. If a loss is not finite, the guard repairs the scene and the view is rendered again.
-        Raises TrainingDiverged: the scene cannot be repaired, or the limit of rollbacks is reached."""
+        """Compute `view_losses`; if one is not finite, the guard repairs the scene and the view is rendered again.
+        Raises TrainingDiverged: see `RollbackGuard.repair`."""
         dropout = self.schedule.dropout(self.processes.views * self.schedule.max_steps / len(self._full_size))
         while True:
             descent = self.texels.prepare(self.step, view, self.guard.factor)
@@ -233,9 +230,8 @@ class Training:
             self._set_rates()
 
     def seconds_at(self, factor: float) -> float:
-        """Measure the CPU seconds of a training view at another size, drawn, compared and differentiated: the least of
-        a few, as the first ones pay for memory that later steps find. The gradients are dropped: the run goes on as if
-        nothing had been drawn. CPU time, as other programs may interrupt."""
+        """Measure the CPU seconds of a training view at another size, drawn, compared and differentiated, without a
+        trace in the run: the least of a few, as the first ones pay for memory that later steps find."""
         learned = [parameter for parameter in self.scene.parameters() if parameter.requires_grad]
         seconds = []
         for index in spread(len(self._full_size), TIMED_VIEWS):
@@ -248,9 +244,8 @@ class Training:
         return min(seconds)
 
     def combine(self) -> dict[str, Tensor]:
-        """Average the gradients over all views of the step; call it after the backward passes. Returns rate factors [N]
-        per surfel, by parameter name, for `optimizers.step`. Raises ProcessesApart, ProcessLost: see
-        `Processes.average_gradients`."""
+        """Average the gradients over all views of the step, and update the texels, after the backward passes. Returns
+        row factors for `optimizers.step`. Raises as `Processes.average_gradients`."""
         if self.processes.views > 1:
             groups = (group for optimizer in self.optimizers.values() for group in optimizer.param_groups)
             learned = [parameter for group in groups for parameter in group["params"]]
@@ -260,9 +255,8 @@ class Training:
         return self.step_sizes.factors()
 
     def finish(self) -> dict[str, float]:
-        """Densify, prune, check for divergence and stop the clock; call it after the optimisers. Returns numbers by
-        action (pruned, rolled_back, ...); empty if none. Raises TrainingDiverged: the limit of rollbacks is reached, or
-        rollbacks are disabled."""
+        """After the optimisers, densify, prune, check for divergence and stop the clock. Returns numbers by action
+        (pruned, rolled_back, ...). Raises TrainingDiverged: see `RollbackGuard.repair`."""
         step, projections, photometric = self.step, self._projections, self._photometric
         assert projections, "a step is finished after its losses"
         self._projections, self._photometric = [], []
@@ -292,12 +286,12 @@ class Training:
 
     @property
     def by_memory(self) -> dict[str, int]:
-        """Numbers at which memory has stopped surfels and texels; without those that it has not."""
+        """Numbers at which memory has stopped surfels and texels, if it has."""
         bounds = {"surfels": self.strategy.most_by_memory, "texels": self.texels.most_by_memory}
         return {f"{what}_by_memory": most for what, most in bounds.items() if most}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the state of the run, without the scene and its optimisers."""
+        """Return the state of the run, without scene and optimisers."""
         return {
             "strategy": self.strategy.state_dict(),
             "guard": self.guard.state_dict(),
@@ -312,7 +306,7 @@ class Training:
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore what `state_dict` returned, also of a run of another length; call it once the scene is restored."""
+        """Restore what `state_dict` returned, also of a run of another length, after the scene."""
         schedule = self.schedule
         length = state.get("max_steps") or schedule.max_steps  # checkpoints of earlier versions have fewer entries
         if isinstance(self.scene.field, TexelField):
@@ -334,7 +328,7 @@ class Training:
 
 
 class Stopwatch:
-    """Wall-clock and CPU seconds of the training steps; evaluation, saving and loading are not counted."""
+    """Wall-clock and CPU seconds of the training steps."""
 
     def __init__(self, seconds: float = 0.0, cpu_seconds: float = 0.0) -> None:
         self.seconds = seconds

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 
-from bitymi_ns.bake import Coded, Reduced, Rounded, Stage, TuneOptions, compact, export, tune_atlas
+from bitymi_ns.bake import Reduced, Rounded, Stage, TuneOptions, compact, export, tune_atlas
 from bitymi_ns.bake.compact import ENOUGH, MAX_LAMBDA, START, TEXEL_SHARE, Coder, Compact, compacted
 from bitymi_ns.bake.precision import PER_BIT
 from bitymi_ns.bundle import check_files
 from bitymi_ns.train.views import View
-from tests.bake.test_tune import BACKGROUND, photographs, render
+from tests.bake.test_tune import BACKGROUND, error, photographs, render
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +26,6 @@ def views(truth: Reduced) -> list[View]:
 @pytest.fixture(scope="module")
 def rounded(truth: Reduced, views: list[View]) -> Rounded:
     return compacted(truth, views, BACKGROUND, Compact(share=0.05))
-
-
-def error(a: Stage, b: Stage, views: list[View]) -> float:
-    pictures = [(render(a, view.camera), render(b, view.camera)) for view in views]
-    return sum(float((x.clamp(0, 1) - y.clamp(0, 1)).square().mean()) for x, y in pictures) / len(pictures)
 
 
 def from_photographs(baked: Stage, views: list[View]) -> float:
@@ -45,7 +40,7 @@ def test_what_costs_less_takes_more_bytes(truth: Reduced, views: list[View], mon
         rounded = compacted(truth, views, BACKGROUND, Compact(share=share, views=len(views)))
         allowed = share * from_photographs(truth, views)
         assert 0 < rounded.statistics.rounding.mse <= 1.001 * allowed
-        assert error(truth, rounded, views) < 4 * allowed
+        assert from_photographs(rounded, photographs(truth)) < 4 * allowed
         assert sorted(rounded.rows.tolist()) == sorted(truth.rows.tolist())
         sizes.append(rounded.codes.nbytes() + rounded.encoded().codes.texels.nbytes())
     assert sizes[1] < 0.9 * sizes[0]
@@ -120,12 +115,7 @@ def test_texels_learn_through_their_coding(rounded: Rounded, views: list[View], 
     coarse = replace(rounded, step=30.0)
     still = tune_atlas(coarse, views, BACKGROUND, replace(options, coded_steps=0))
     tuned = tune_atlas(coarse, views, BACKGROUND, options)
-
-    def against_photographs(baked: Coded) -> float:
-        drawn = [(baked.scene.render(v.camera, BACKGROUND).rgb, v.image) for v in views]
-        return sum(float((rgb.clamp(0, 1) - image).square().mean()) for rgb, image in drawn)
-
-    assert against_photographs(tuned) <= against_photographs(still)
+    assert error(tuned, views) <= error(still, views)
     torch.testing.assert_close(tuned.scene.mean_residual, tuned.codes.texels.constants)
     export(tuned, tmp_path / "b")
     bundle, checks = check_files(tmp_path / "b")

@@ -1,5 +1,6 @@
 """Tiles are as small as the tolerance allows, but not smaller."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,22 +14,25 @@ from bitymi_ns.bake.tiles import fit, interpolation
 from bitymi_ns.ops.reference.render import texel, texel_centers
 from bitymi_ns.scene.tile_sizes import kernel_parameters, visible_extent
 from bitymi_ns.train.init import tangents
+from tests.bake.conftest import WaveField
 
 OPTIONS = BakeOptions(format="fp16")
 BOUND = 0.02
 
 
-class PlaneField:
-    """A residual that depends on one coordinate, linearly or as a wave."""
+class GivenField(WaveField):
+    """A residual colour by a function of positions."""
 
-    def __init__(self, direction: torch.Tensor, frequency: float, amplitude: float = 0.2, voxel: float = 0.02) -> None:
-        self.direction, self.frequency, self.amplitude, self.voxel = direction, frequency, amplitude, voxel
+    def __init__(self, color: Callable[[torch.Tensor], torch.Tensor]) -> None:
+        super().__init__(voxel=0.02)
+        self.color = color
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
-        return (self.amplitude * torch.sin(self.frequency * (x @ self.direction)))[:, None].expand(-1, 3)
+        return self.color(x)
 
-    def voxel_size(self, x: torch.Tensor) -> torch.Tensor:
-        return torch.full((len(x), 2), self.voxel)
+
+def wave(direction: torch.Tensor, frequency: float) -> GivenField:
+    return GivenField(lambda x: (0.2 * torch.sin(frequency * (x @ direction)))[:, None].expand(-1, 3))
 
 
 @pytest.fixture
@@ -86,9 +90,7 @@ def test_the_visible_extent_is_where_the_kernel_falls_to_the_bound():
 
 
 def test_a_constant_residual_needs_no_tile(discs):
-    made, _ = discs(PlaneField(torch.tensor([1.0, 0.0, 0.0]), 0.0))
-    flat = type("Flat", (PlaneField,), {"__call__": lambda self, x: torch.full((len(x), 3), 0.25)})
-    made.field = flat(torch.zeros(3), 0.0)
+    made, _ = discs(GivenField(lambda x: torch.full((len(x), 3), 0.25)))
     baked = bake_field(made, options=OPTIONS)
     assert baked.atlas is None and not baked.packing.tiles.any()
     torch.testing.assert_close(baked.scene.mean_residual, torch.full((8, 3), 0.25))
@@ -98,14 +100,14 @@ def test_a_constant_residual_needs_no_tile(discs):
 @pytest.mark.parametrize("axis", [0, 1])
 def test_detail_along_one_axis_refines_that_axis_alone(discs, axis):
     made, axes = discs()
-    made.field = PlaneField(axes[:, axis], 30.0)
+    made.field = wave(axes[:, axis], 30.0)
     sizes = bake_field(made, options=OPTIONS).packing.tiles[:, 3:]
     assert (sizes[:, 1 - axis] == 4).all() and (sizes[:, axis] >= 16).all()
 
 
 def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(discs, camera):
     made, axes = discs()
-    made.field = PlaneField(axes[:, 0] + 0.3 * axes[:, 1], 25.0)
+    made.field = wave(axes[:, 0] + 0.3 * axes[:, 1], 25.0)
     sizes = {}
     for tolerance in (0.1, 0.5, 2.0, 20.0):
         baked = bake_field(made, options=replace(OPTIONS, tolerance=tolerance))
@@ -120,7 +122,7 @@ def test_the_error_stays_below_the_tolerance_and_the_next_smaller_grid_does_not(
 
 def test_the_error_between_texel_centres_is_hardly_larger(discs):
     made, axes = discs()
-    made.field = PlaneField(axes[:, 0], 25.0)
+    made.field = wave(axes[:, 0], 25.0)
     baked = bake_field(made, options=replace(OPTIONS, tolerance=1.0))
     uv = (torch.rand(200_000, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1) * float(baked.extent[0])
     at_centers = error_of_the_first(baked, made, axes, centers(baked))
@@ -131,17 +133,17 @@ def test_texels_out_of_sight_do_not_widen_the_range(discs):
     made, _ = discs()
     radius = float(visible_extent(*kernel_parameters(made.surfels), BOUND)[0]) * 0.1353353
 
-    def wild_outside(self, x):
+    def wild_outside(x):
         inside = x.norm(dim=1, keepdim=True) < 1.001 * radius
         return torch.where(inside, 0.2 * torch.sin(60 * x), 1000.0)
 
-    made.field = type("Wild", (PlaneField,), {"__call__": wild_outside})(torch.zeros(3), 0.0)
+    made.field = GivenField(wild_outside)
     assert bake_field(made, options=OPTIONS).texels.abs().max() < 0.5
 
 
 def test_what_is_hidden_counts_less(discs):
     made, axes = discs()
-    made.field = PlaneField(axes[:, 0], 25.0)
+    made.field = wave(axes[:, 0], 25.0)
     inputs = BakeInput(made.surfels, (), 0.2, BOUND)
 
     def grids_behind(transmittance):

@@ -38,11 +38,16 @@ def ball() -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.fixture(scope="session")
-def views(cameras, ball) -> list[View]:
+def truth(cameras, ball) -> Scene:
+    """The scene in the photographs."""
     centers = torch.stack([camera.center for camera in cameras])
     surfels, _ = surfels_from_points(*ball, centers, TrainConfig(), SceneConfig())
     surfels["opacity_logits"].fill_(4.0)
-    truth = Scene(SceneConfig(), surfels, None)
+    return Scene(SceneConfig(), surfels, None)
+
+
+@pytest.fixture(scope="session")
+def views(cameras, truth) -> list[View]:
     with torch.no_grad():
         return [View(camera, truth.render(camera).rgb.clamp(0, 1)) for camera in cameras]
 

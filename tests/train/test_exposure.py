@@ -264,29 +264,25 @@ def test_scores_are_of_the_corrected_image(make_scene, views) -> None:
     assert multi_view_scores(scene, [view._replace(correction=None)], TrainConfig()).importance.sum() > 0
 
 
-def test_states_of_earlier_versions_other_options_and_other_photographs(make_scene, uneven) -> None:
-    trainer = Trainer(make_scene(), uneven, config("gain"), 20)
-    trainer.advance()
-    state = trainer.training.exposure.state_dict()
+@pytest.mark.parametrize(
+    ("kind", "saved", "views", "decided"),
+    [
+        ("affine", "gain", 6, False),  # starts over
+        ("gain", "gain", 5, False),
+        ("gain", None, 6, False),
+        ("auto", None, 6, True),
+        ("auto", "off", 6, True),
+        ("off", "gain", 6, True),
+    ],
+)
+def test_states_of_earlier_versions_other_options_and_other_photographs(kind, saved, views, decided) -> None:
+    states = {None: None, "off": Exposure("off").state_dict(), "gain": started("gain", torch.ones(6, 3)).state_dict()}
+    exposure = Exposure(kind)
+    exposure.load_state_dict(states[saved], views)
+    assert exposure.decided == decided and exposure.table is None
     there = Exposure("gain")
-    there.load_state_dict(state, 6, "meta")
+    there.load_state_dict(states["gain"], 6, "meta")
     assert there.table.device.type == there.of(0).device.type == "meta"
-    older = Exposure("auto")
-    older.load_state_dict(None, 6)
-    assert older.decided and older.table is None
-    for kind, count in (("affine", 6), ("gain", 5)):
-        other = Exposure(kind)
-        other.load_state_dict(state, count)
-        assert not other.decided  # starts over
-    off = Exposure("off")
-    off.load_state_dict(state, 6)
-    assert off.decided and off.table is None
-    asked = Exposure("gain")
-    asked.load_state_dict(None, 6)
-    resumed = Exposure("auto")
-    resumed.load_state_dict(Exposure("off").state_dict(), 6)
-    assert resumed.decided and resumed.table is None
-    assert not asked.decided
 
 
 def test_the_photographs_of_a_run_with_its_corrections(make_scene, uneven) -> None:

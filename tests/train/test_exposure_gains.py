@@ -63,18 +63,15 @@ def test_masks_transparency_bytes_and_reduced_pictures(ball) -> None:
     wrong = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     wrong[:, : SIZE // 2] = True
     other = [v.image.where(~wrong[..., None], torch.full((), 0.1 * (i % 3 + 1))) for i, v in enumerate(views)]
-    for kind in ("mask", "alpha", "bytes", "half"):
-        if kind == "mask":
-            made = [View(v.camera, torch.where(wrong[..., None], math.nan, v.image), ~wrong) for v in views]
-        elif kind == "alpha":
-            alpha = (~wrong).float()[..., None]
-            made = [View(v.camera, torch.cat([o, alpha], -1)) for v, o in zip(views, other, strict=True)]
-        elif kind == "bytes":
-            made = [v._replace(image=(255 * v.image).round().to(torch.uint8)) for v in views]
-        else:
-            made = [v._replace(image=v.image[::2, ::2].contiguous()) for v in views]
-        found = estimate_gains(points, made, 0.02)
-        torch.testing.assert_close(found.log_gains, logs, rtol=0, atol=0.03, msg=kind)
+    alpha = (~wrong).float()[..., None]
+    kinds = {
+        "mask": [View(v.camera, torch.where(wrong[..., None], math.nan, v.image), ~wrong) for v in views],
+        "alpha": [View(v.camera, torch.cat([image, alpha], -1)) for v, image in zip(views, other, strict=True)],
+        "bytes": [v._replace(image=(255 * v.image).round().to(torch.uint8)) for v in views],
+        "half": [v._replace(image=v.image[::2, ::2].contiguous()) for v in views],
+    }
+    for kind, made in kinds.items():
+        torch.testing.assert_close(estimate_gains(points, made, 0.02).log_gains, logs, rtol=0, atol=0.03, msg=kind)
 
 
 def test_clipped_and_black_pixels_do_not_count() -> None:

@@ -94,14 +94,13 @@ def run(make_scene, views: list[View], steps: int = 60, **loss) -> tuple[Scene, 
     return scene, terms
 
 
-def with_depth(views: list[View], make_scene) -> list[View]:
+def with_depth(views: list[View]) -> list[View]:
     """Add the depth of the unit ball to views."""
     result = []
+    ys, xs = np.mgrid[0:48, 0:48] + 0.5
+    rays = np.stack([(xs - 24) / 45.12, (ys - 24) / 45.12, np.ones_like(xs)], -1)
     for view in views:
-        camera = view.camera
-        ys, xs = np.mgrid[0:48, 0:48] + 0.5
-        rays = np.stack([(xs - 24) / 45.12, (ys - 24) / 45.12, np.ones_like(xs)], -1)
-        center = camera.viewmat[:3, 3].double().numpy()
+        center = view.camera.viewmat[:3, 3].double().numpy()
         a, b, c = (rays**2).sum(-1), rays @ center, center @ center - 1.0
         root = b**2 - a * c
         z = np.where(root > 0, (b - np.sqrt(np.maximum(root, 0))) / a, 0.0)
@@ -116,7 +115,7 @@ def off_the_surface(scene: Scene, views: list[View]) -> float:
 
 
 def test_depth_moves_surfels_to_the_surface(make_scene, views) -> None:
-    known = with_depth(views, make_scene)
+    known = with_depth(views)
 
     def shifted(*args, **kwargs):
         scene = make_scene(*args, **kwargs)

@@ -34,13 +34,6 @@ def motion(seed: int, size: float) -> Tensor:
     return size * torch.randn(6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
 
 
-@pytest.fixture(scope="module")
-def truth(cameras, ball) -> Scene:
-    surfels, _ = surfels_from_points(*ball, torch.stack([c.center for c in cameras]), TrainConfig(), SceneConfig())
-    surfels["opacity_logits"].fill_(4.0)
-    return Scene(SceneConfig(), surfels, None)
-
-
 def off(view: View, by: Tensor) -> View:
     return view._replace(camera=view.camera.posed(moved(view.camera.viewmat.double(), by)))
 

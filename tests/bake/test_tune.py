@@ -154,14 +154,6 @@ def test_it_gives_up_without_a_gain(wrong: Reduced, views: list[View], patience:
     assert kept.statistics.finetune.best_step == 0
     torch.testing.assert_close(kept.texels, wrong.texels, rtol=0, atol=0)
 
-    def interrupt(step: str, done: int, total: int) -> None:
-        if step == "tuning texels" and done == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        tune_atlas(wrong, views, BACKGROUND, OPTIONS, interrupt)
-    assert (wrong.texels == 0.1).all()
-
 
 @pytest.mark.parametrize("coded", [False, True])
 def test_the_best_texels_are_kept(wrong: Reduced, views: list[View], monkeypatch: Patch, coded: bool) -> None:

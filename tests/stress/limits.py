@@ -15,10 +15,6 @@ class Case:
     flipped: float
     way: Way = PLAIN
 
-    @property
-    def name(self) -> str:
-        return self.scene.name
-
 
 ALLOWED: dict[str, tuple[tuple[float, float, float], ...]] = {
     "edge_on": ((2e-06, 2e-06, 0), (2e-06, 2e-06, 0), (3e-06, 2e-06, 0)),

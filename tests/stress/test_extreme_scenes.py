@@ -14,10 +14,9 @@ from tests.stress.limits import Case, cases
 pytestmark = pytest.mark.slow
 
 CASES = cases()
-NAMES = [case.name for case in CASES]
 LONG = "thousands_on_one_pixel"
 """Measured with one colouring only: it takes as long as all others together, and lists are the same."""
-EVERY = [case for way in (PLAIN, *WAYS) for case in cases(way) if way is PLAIN or case.name != LONG]
+EVERY = [case for way in (PLAIN, *WAYS) for case in cases(way) if way is PLAIN or case.scene.name != LONG]
 
 
 def scene_and_camera(case: SceneCase, backend: Backend, dtype: torch.dtype, **options) -> tuple[Scene, Camera]:
@@ -31,7 +30,7 @@ def scene_and_camera(case: SceneCase, backend: Backend, dtype: torch.dtype, **op
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["double", "single"])
-@pytest.mark.parametrize("case", CASES, ids=NAMES)
+@pytest.mark.parametrize("case", CASES, ids=[case.scene.name for case in CASES])
 def test_finite_in_finite_out(case: Case, dtype: torch.dtype, backend: Backend) -> None:
     scene, camera = scene_and_camera(case.scene, backend, dtype, texture_moves_surfels=True)
     output = scene.render(camera, case.scene.background.to(backend.device, dtype), maps=True)
@@ -44,7 +43,7 @@ def test_finite_in_finite_out(case: Case, dtype: torch.dtype, backend: Backend) 
         assert parameter.grad is None or parameter.grad.isfinite().all(), name
 
 
-@pytest.mark.parametrize("case", EVERY, ids=[f"{case.way.name}-{case.name}" for case in EVERY])
+@pytest.mark.parametrize("case", EVERY, ids=[f"{case.way.name}-{case.scene.name}" for case in EVERY])
 def test_errors_are_within_the_stated_figures(case: Case, backend: Backend) -> None:
     errors = measure(case.scene, backend, way=case.way)
     assert errors.finite

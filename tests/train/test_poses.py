@@ -162,18 +162,10 @@ def test_poses_stay_before_and_after_their_part(make_scene, wrong):
     assert not torch.equal(seen[18], seen[19]) and all(torch.equal(seen[19], later) for later in seen[20:])
 
 
-def test_a_resumed_run_goes_on_from_the_poses(make_scene, wrong):
-    straight = advanced(Trainer(make_scene(texture=False), wrong, options("on"), 60), 30)
-    state = state_of(straight)
-    resumed = Trainer(make_scene(texture=False, every=5), wrong, options("on"), 60)
-    resume(resumed, state)
-    for _ in range(20):
-        straight.advance()
-        resumed.advance()
-    motions = [run.training.poses.motions for run in (straight, resumed)]
-    torch.testing.assert_close(*motions, rtol=1e-4, atol=1e-8)
-    assert not torch.equal(motions[0], state["training"]["poses"]["motions"])
-    fixed = Trainer(make_scene(texture=False), wrong, options("off"), 60)  # keeps the refined poses
+def test_a_run_that_refines_no_further_keeps_the_poses(make_scene, wrong):
+    state = state_of(advanced(Trainer(make_scene(texture=False), wrong, options("on"), 60), 30))
+    assert state["training"]["poses"]["motions"].any()
+    fixed = Trainer(make_scene(texture=False), wrong, options("off"), 60)
     resume(fixed, state)
     fixed.advance()
     assert torch.equal(fixed.training.poses.motions, state["training"]["poses"]["motions"])

@@ -248,32 +248,29 @@ def test_a_scene_over_the_cap_loses_its_faintest_at_once(bench, step, cap):
     assert b.x == list(range(20 - cap, 20))
 
 
-def test_faint_surfels_make_room_for_important_ones_at_the_cap(bench):
-    b = bench(40, max_surfels=42, prune_budget=0.0)
-    b.set("opacity_logits", slice(0, 8), torch.linspace(-4.0, -3.1, 8))  # all below 0.05
-    b.importance[2:30] = 10
+@pytest.mark.parametrize(
+    ("cap", "faint", "important", "step", "replaced", "cloned"),
+    [
+        (42, (-4.0, -3.1), slice(2, 30), LAST_DENSIFY, [0, 1], 4),  # room for two of 28; the others are important
+        (42, (-3.1, -4.0), slice(30, 35), LAST_DENSIFY, [5, 6, 7], 5),  # only as many as needed, the faintest
+        (46, (-4.0, -3.1), slice(2, 30), 13_500, [], 2),  # 1,500 steps after a reset
+    ],
+)
+def test_faint_surfels_make_room_for_important_ones_at_the_cap(
+    bench, cap, faint, important, step, replaced, cloned
+) -> None:
+    b = bench(40, max_surfels=cap, prune_budget=0.0)
+    b.set("opacity_logits", slice(0, 8), torch.linspace(*faint, 8))  # all below 0.05
+    b.importance[important] = 9
     b.see(1.0, 1.0)
-    report = b.step(LAST_DENSIFY)
-    # 28 request children, there is room for two, and only 0 and 1 are faint and do not
-    assert (report["replaced"], report["cloned"]) == (2, 4)
-    assert len(b.scene) == 42 and b.x[:38] == [*range(2, 40)]
+    report = b.step(step)
+    assert (report["replaced"], report["cloned"]) == (len(replaced), cloned)
+    rest = [row for row in range(40) if row not in replaced]
+    assert b.x[: len(rest)] == rest and len(b.scene) == len(rest) + cloned
     check(b)
-    b = bench(40, max_surfels=42, prune_budget=0.0)  # only as many as needed, the faintest
-    b.set("opacity_logits", slice(0, 8), torch.linspace(-3.1, -4.0, 8))
-    b.importance[30:35] = 9
-    b.see(1.0, 1.0)
-    report = b.step(LAST_DENSIFY)
-    assert (report["replaced"], report["cloned"]) == (3, 5)
-    assert b.x[:37] == [*range(5), *range(8, 40)]
 
 
-def test_no_surfel_makes_room_after_a_reset_or_at_the_bound_by_pixels(bench):
-    b = bench(40, prune_budget=0.0, max_surfels=46)
-    b.set("opacity_logits", slice(0, 8), torch.linspace(-4.0, -3.1, 8))
-    b.importance[2:30] = 9
-    b.see(1.0, 1.0)
-    report = b.step(13_500)  # the third last densification, 1,500 steps after a reset
-    assert (report["replaced"], report["cloned"]) == (0, 2)
+def test_no_surfel_makes_room_at_the_bound_by_pixels(bench):
     b = bench(40, prune_budget=0.0)
     b.strategy.most = 42
     b.importance[2:30] = 9

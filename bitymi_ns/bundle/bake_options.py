@@ -34,11 +34,10 @@ class BakeOptions:
     """Largest half side of a tile in scale units (the paper's e, 4 there); 3 is the kernel's support. With a tolerance
     a tile covers only fragments above the weight bound."""
     tolerance: Annotated[float, Field(ge=0, lt=STEPS)] = 0.75
-    """Largest error of the reduction, in 8-bit steps, weighted by a fragment's largest contribution to a pixel. A tile
-    takes the smallest grid, or none, whose root mean square error over its visible part is within it. A view colour
-    keeps the fewest Spherical Voronoi sites, or one colour (other kinds: everything or one colour), whose largest error
-    is within it, over directions in and around the training views that see the surfel. 0: tile sizes by the Nyquist
-    rule, view colours unchanged."""
+    """Largest error of the reduction, in 8-bit steps, weighted by a fragment's largest contribution to a pixel: root
+    mean square over the visible part of a tile, which takes the smallest grid, or none; largest over the directions of
+    a view colour, which keeps the fewest Spherical Voronoi sites, or one colour (other kinds: everything or one
+    colour). 0: tile sizes by the Nyquist rule, view colours unchanged."""
     local_voxel: bool = True
     """Choose a tile's size by the field's voxels at the surfel; False: by the scene's smallest, as in the paper."""
     cap_by_views: bool = True

@@ -104,7 +104,7 @@ class ColumnEntry(Part):
 
 
 class PositionFrame(Part):
-    """Grid of positions: x = center + scale sinh(low + step k), `codec.surfel_codes.PositionGrid`."""
+    """Grid of positions, `codec.surfel_codes.PositionGrid`."""
 
     center: tuple[Coordinate, Coordinate, Coordinate]
     scale: Annotated[float, Field(gt=0, le=LIMITS["means"][0])]

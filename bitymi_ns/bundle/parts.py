@@ -147,9 +147,9 @@ def parts_of(bundle: str | Path, inside: bool = False) -> Iterator[Parts]:
 
 
 def _read_directory(file: BufferedReader) -> tuple[dict[str, _Entry], int]:
-    """Read the directory of a single file as web/src/bundle/archive.ts does: where parts of each name are said to be,
-    and where the directory begins. Hashes in bundle.json decide whether parts are whole. Raises ValueError: there is
-    none, or the file does not begin with the first part and could be of another type, too."""
+    """Read the directory of a single file as web/src/bundle/archive.ts does: where parts are said to be, by name, and
+    where the directory begins. Raises ValueError: there is none, or the file does not begin with the first part and
+    could be of another type, too."""
     size = file.seek(0, os.SEEK_END)
     records = _LARGE.size + _LARGE_AT.size + _END.size
     file.seek(max(0, size - records))
@@ -223,8 +223,8 @@ def _is_archive(path: Path) -> bool:
 
 
 def check_target(folder: str | Path, overwrite: bool = False) -> None:
-    """Check that a bundle may be written to a folder. Raises BundleError: the folder exists and `overwrite` is off, is
-    not a bundle, or holds foreign files or a notes.json that cannot be carried over."""
+    """Check that a bundle may be written to a folder. Raises BundleError: it exists and `overwrite` is off, is not a
+    bundle, or holds foreign files or an unreadable notes.json."""
     folder = Path(folder)
     made = _replaced(folder) if (folder / MANIFEST).is_file() else None
     check_replaceable(folder, f"a bundle (it has no {MANIFEST})", made, overwrite, BundleError, "--overwrite True")
@@ -242,15 +242,15 @@ def reserved_bundle(folder: str | Path, overwrite: bool, tell: Tell = warnings.w
 
 
 def _replaced(folder: Path) -> Iterator[str]:
-    """Yield the files of a bundle, and its notes.json, which must be readable to be carried over."""
+    """Yield the files of a bundle, and its notes.json, which must be readable."""
     with parts_of(folder) as parts:
         notes_data(parts)
     yield from (*files_of(folder), NOTES)
 
 
 def files_of(folder: Path) -> list[str]:
-    """List the files of a bundle of any version, with config.yml, and cameras.json, which the first versions of
-    `bake_scene` did not list in bundle.json. Raises BundleError: bundle.json is unreadable."""
+    """List the files of a bundle of any version, with config.yml, and cameras.json, which early bundles did not list.
+    Raises BundleError: bundle.json is unreadable."""
     try:
         with parts_of(folder) as parts:
             listed = json_of(bytes(parts.read(MANIFEST, MANIFEST_LIMIT)))["files"]

@@ -88,8 +88,8 @@ def read_bundle(folder: str | Path, verify: bool = True, decode: bool = True, cr
     Args:
         folder: the bundle's folder, or its single file.
         verify: compare every file with its SHA-256 (sizes are always compared).
-        decode: decode a BC7 atlas to four bytes per texel; a CUDA device draws from the blocks alone. False also
-            encodes compact atlases of at least `LARGE_ATLAS` to BC7.
+        decode: decode a BC7 atlas to four bytes per texel, which a CUDA device does not need. False also encodes
+            compact atlases of at least `LARGE_ATLAS` to BC7.
         crop: leave out the surfels that notes.json hides.
 
     Raises BundleError: a file of the scene is missing, truncated, altered or malformed, a value is out of range, the
@@ -150,9 +150,9 @@ def download_bytes(folder: Path, info: Manifest) -> int:
 
 
 def read_file(parts: Parts, info: Manifest, name: str, verify: bool = True, keep: bool = True) -> bytearray:
-    """Read a file listed in bundle.json. `verify`: compare it with its SHA-256. `keep`: False: only check it and return
-    no bytes. Raises BundleError: the file is missing, its size or hash differs, its header contradicts its size or
-    bundle.json, or its contents exceed this machine's memory; all but the hash is checked before reading."""
+    """Read a file listed in bundle.json. `verify`: compare it with its SHA-256. `keep`: False: only check it. Raises
+    BundleError: the file is missing, its size or hash differs, its header contradicts its size or bundle.json, or its
+    contents exceed this machine's memory; all but the hash is checked before reading."""
     path, entry = parts.bundle / name, info.files[name]
     with parts.opened(name) as (file, size):
         if size != entry.bytes:

@@ -60,8 +60,8 @@ class Percentiles(Part):
 
 
 class Certificate(Part):
-    """Numbers of surfels whose stored residual is within the tolerance in the closest training view: error times
-    blending weight, averaged per pixel, root mean square over the tile; without alphas."""
+    """Numbers of surfels whose stored residual, without alphas, is within the tolerance in the closest training view:
+    error times blending weight, averaged per pixel, root mean square over the tile."""
 
     against: Literal["field", "texels"]  # reference: texels before quantisation; earlier: the field
     tolerance: NotNegative
@@ -105,7 +105,7 @@ class KeptTexels(Part):
     polished: Count | None = None  # before the polish
     learned: Count | None = None  # trained ones
     kept: Count | None = None
-    not_finite: Count | None = None  # where the field was not finite
+    not_finite: Count | None = None  # of the field
 
 
 class AtlasCost(Part):
@@ -117,7 +117,7 @@ class AtlasCost(Part):
 
 
 class Kept(Part):
-    """Numbers of sites, coefficients or lobes, or bytes, before and after."""
+    """Numbers of terms, or bytes, before and after."""
 
     before: Count | None = None
     after: Count
@@ -170,8 +170,8 @@ class FineTuning(Part):
 
 
 class HeldOut(Part):
-    """Mean PSNR over the held-out views, dB, of the bundle (`baked`), the trained scene (`neural`) and the photographs
-    against each other; `worst`: of the view where bundle and trained scene differ most."""
+    """Mean PSNR over the held-out views, dB, of bundle (`baked`), trained scene (`neural`) and photographs against each
+    other; `worst`: of the view where bundle and trained scene differ most."""
 
     views: Whole | None = None
     psnr_baked_against_neural: Decibels = None

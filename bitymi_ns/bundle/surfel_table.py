@@ -102,12 +102,14 @@ def term_columns(surfels: Mapping[str, Tensor]) -> dict[str, npt.NDArray]:
     return {name: ordered[:, i] for i, name in enumerate(_numbered("term", ordered.shape[1]))}
 
 
-def _bounded(columns: Mapping[str, npt.NDArray], name: str, low: float, high: float) -> Tensor:
-    values = _stack(columns, (name,))[:, 0].contiguous()
+def check_range(
+    name: str, values: Tensor, low: float, high: float, refuse: Callable[[str], Exception] = PlyError
+) -> Tensor:
+    """Return a column's values [N]. Raises `refuse`, naming the row: one is out of range."""
     bad = ~((values >= low) & (values <= high))
     if bad.any():
         row = int(torch.nonzero(bad)[0])
-        raise PlyError(f"{name} is {values[row]:g} in row {row}; it must be from {low:g} to {high:g}")
+        raise refuse(f"{name} is {values[row]:g} in row {row}; it must be from {low:g} to {high:g}")
     return values
 
 
@@ -168,13 +170,16 @@ def from_columns(
         check_limits({"mean_residual": residual}, kind)
     extents = torch.full((count,), extent, dtype=torch.float32)
     if EXTENT_COLUMN in columns:
-        extents = _bounded(columns, EXTENT_COLUMN, *EXTENTS)
+        extents = check_range(EXTENT_COLUMN, _stack(columns, (EXTENT_COLUMN,))[:, 0], *EXTENTS)
+    alphas = None
+    if has_alpha:
+        alphas = check_range(ALPHA_COLUMN, _stack(columns, (ALPHA_COLUMN,))[:, 0], 0.0, ALPHA_LIMIT)
     return {
         "surfels": surfels,
         "tiles": tiles.contiguous(),
         "extent": extents,
         "mean_residual": residual,
-        "mean_alpha": _bounded(columns, ALPHA_COLUMN, 0.0, ALPHA_LIMIT) if has_alpha else None,
+        "mean_alpha": alphas,
     }
 
 

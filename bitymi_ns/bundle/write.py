@@ -39,7 +39,7 @@ from .manifest import (
 from .parts import NOTES, check_target, notes_data, parts_of
 from .poster import Pixels, encode_poster, most_bytes
 from .read import Bundle, read_bundle, read_manifest
-from .surfel_table import EXTENT_COLUMN, TERMS, check_limits, term_columns, to_columns
+from .surfel_table import ALPHA_COLUMN, EXTENT_COLUMN, TERMS, check_limits, check_range, term_columns, to_columns
 from .world import World, same_frame
 
 GENERATOR = f"bitymi-ns {importlib.metadata.version('bitymi-ns')}"
@@ -66,10 +66,10 @@ def write_bundle(
     Args:
         scene: on the CPU, all numbers finite; its own atlas is ignored. An atlas with alphas requires mean alphas.
         atlas: of the texels, an `EncodedAtlas` where there are no codes; None: no texture.
-        codes: codes of surfels and texels, for a compact bundle; scene and atlas must be decoded from them.
+        codes: of a compact bundle; scene and atlas must be decoded from them.
         statistics: of the bake (`statistics.Statistics`).
         extra_files: further files by name, such as preview.png.
-        loose_files: files that may be edited later, not covered by bundle.json.
+        loose_files: such files that bundle.json does not cover.
         overwrite: replace an existing bundle, carrying over its notes.json.
         interchange: also write surfels.ply into a compact bundle, for other programs.
         poster: [H, W, 3] picture of the viewer's first view.
@@ -182,19 +182,14 @@ def _describe(
         if own:
             described["surfels"]["activations"] = {**ACTIVATIONS, **own}
     if atlas is not None:
+        same = ("format", "width", "height", "layers", "clipped_fraction", "encoder", "psnr")
         described["atlas"] = {
-            "format": atlas.format,
-            "width": atlas.width,
-            "height": atlas.height,
-            "layers": atlas.layers,
+            **{name: getattr(atlas, name) for name in same},
             "extent_column": EXTENT_COLUMN,
             "offset": atlas.range.offset,
             "scale": atlas.range.scale,
-            "alpha_scale": atlas.alpha_scale or None,
             "range": atlas.range.rule,
-            "clipped_fraction": atlas.clipped_fraction,
-            "encoder": atlas.encoder,
-            "psnr": atlas.psnr,
+            "alpha_scale": atlas.alpha_scale or None,
         }
     return described
 
@@ -211,10 +206,7 @@ def _check_alpha(scene: BakedScene, atlas: Atlas | None, codes: SceneCodes | Non
         return
     if scene.mean_alpha is None:
         raise BundleError("the atlas has alphas, the surfels have no mean alphas")
-    bad = ~((scene.mean_alpha >= 0) & (scene.mean_alpha <= ALPHA_LIMIT))
-    if bad.any():
-        row = int(torch.nonzero(bad)[0])
-        raise BundleError(f"alpha is {scene.mean_alpha[row]:g} in row {row}; it must be from 0 to {ALPHA_LIMIT:g}")
+    check_range(ALPHA_COLUMN, scene.mean_alpha, 0.0, ALPHA_LIMIT, BundleError)
 
 
 def _check_surfels(scene: BakedScene) -> None:

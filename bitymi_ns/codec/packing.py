@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-GRID = 4  # tiles are aligned to BC7 blocks, so that no block is shared by two surfels
+GRID = 4  # of tiles: no BC7 block is shared by two surfels
 ROWS = 64  # page heights of larger atlases are multiples of this
 
 
@@ -13,12 +13,11 @@ ROWS = 64  # page heights of larger atlases are multiples of this
 class Packing:
     """Layout of the tiles in pages."""
 
-    # [N, 5] int32 (x, y, layer, r_u, r_v): texel origin, page, and size, with u along x; zeros without a tile
-    tiles: npt.NDArray[np.int32]
-    # width, height: size of every page in texels
+    tiles: npt.NDArray[np.int32]  # [N, 5]: x, y, layer, r_u, r_v in texels, u along x; zeros without a tile
+    # width, height: of every page, texels
     width: int
     height: int
-    layers: int  # number of pages
+    layers: int  # pages
     occupancy: float  # share of the pages' texels that belong to a tile
 
     @property
@@ -36,10 +35,10 @@ def pack(resolution: npt.ArrayLike, page_width: int = 4096, max_rows: int = 8192
     """Pack tiles by Shelf-First-Fit-Decreasing (paper, section Texture Baking).
 
     Tiles are sorted by r_v descending, then r_u descending, then index; each goes to the first shelf with room, or
-    opens a new shelf of its own height. Sides are powers of two, so tiles of one size are placed by arithmetic, and
-    page boundaries never cut a shelf. `resolution`: [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) without a
-    tile. `page_width`: a power of two; smaller atlases get narrower pages. `max_rows`: 8192 is the limit of WebGPU and
-    phones. Raises ValueError: sizes are not powers of two or too wide, or more than `max_layers` pages are needed."""
+    opens a new shelf of its own height. Sides are powers of two, so page boundaries never cut a shelf. `resolution`:
+    [N, 2] integers (r_u, r_v), powers of two >= 4; (0, 0) without a tile. `page_width`: a power of two; smaller atlases
+    get narrower pages. `max_rows`: WebGPU and phones take 8192. Raises ValueError: sizes are not powers of two or too
+    wide, or more than `max_layers` pages are needed."""
     sizes = np.asarray(resolution, dtype=np.int64).reshape(-1, 2)
     _check_sizes(sizes, page_width, max_rows)
     tiles = np.zeros((len(sizes), 5), dtype=np.int32)

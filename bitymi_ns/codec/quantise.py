@@ -52,15 +52,15 @@ class Atlas:
     width: int
     height: int
     layers: int  # number of pages
-    range: Range  # quantisation range (offset 0 and scale 1 for fp16)
-    encoder: str  # name of the encoder and its profile
+    range: Range  # offset 0 and scale 1 for fp16
+    encoder: str  # name and profile
     clipped_fraction: float  # share of the tiles' colour values outside the range
     mse: float  # mean squared error of the decoded tiles' colours against the atlas, colour units squared
-    alpha_scale: float  # alpha = alpha_scale * value, as in `BakedScene`; 0 = opaque texels
+    alpha_scale: float  # as in `BakedScene`
 
     @property
     def psnr(self) -> float | None:
-        """PSNR in dB of the decoded tiles' colours against the atlas, peak 1; None if they are equal."""
+        """PSNR of `mse` in dB, peak 1; None: no error."""
         return None if self.mse == 0 else float(-10.0 * np.log10(self.mse))
 
 
@@ -89,8 +89,7 @@ def choose_range(
     """Choose the quantisation range of an atlas's three colour channels.
 
     sigma6: mean +- 6 standard deviations of a bootstrap sample (paper, Quantization). minmax: smallest to largest
-    value. auto: the one with the smaller mean squared 8-bit error on the sample. `texels`: [T, C] float32 texels of the
-    tiles. `samples`: size of the sample."""
+    value. auto: the one with the smaller mean squared error on the sample. `texels`: [T, C] float32, of the tiles."""
     if len(texels) == 0:
         return Range(0.0, 1.0, rule if rule != "auto" else "sigma6")
     sample = texels[np.random.default_rng(seed).integers(0, len(texels), samples), :3]

@@ -64,11 +64,8 @@ class SurfelCodes:
     kind: str  # view-colour kind, a name of `ops.VIEW_COLORS`
     frame: PositionGrid
     steps: Mapping[str, float]  # quantisation step by column, as in `REFERENCE`
-    # column to [rows, numbers] int64. place [N, 1]: ascending Morton codes of the cells: bit 3 i + a is bit i along
-    # axis a. largest [N, 1]: index of the largest quaternion component (wxyz), made positive; rotation [N, 3]: the
-    # others. log_scales [N, 2], opacity [N, 1], beta [N, 1]. size [N, 1]: 16 log2(r_u) + log2(r_v); 0 = no tile.
-    # extent [tiles, 1]: half sides of the tiles. view_base [N, 3], view_count [N, 1]: base colour and number of terms.
-    # term_shape, term_color [T, ...]: numbers of the terms. Colours are green, red - green, blue - green
+    # column of surfels.bin (docs/baking.md), but residual and alpha, to [rows, numbers] int64; place is the Morton
+    # codes themselves, ascending
     codes: Mapping[str, Codes]
 
     def __len__(self) -> int:
@@ -76,7 +73,7 @@ class SurfelCodes:
 
     @property
     def columns(self) -> dict[str, Codes]:
-        """The columns of surfels.bin except residuals: name to [rows, numbers]."""
+        """The columns of surfels.bin, but residual and alpha."""
         return {**self.codes, "place": np.diff(self.codes["place"], axis=0, prepend=0)}
 
     def nbytes(self) -> int:
@@ -193,7 +190,7 @@ def term_numbers(kind: str) -> tuple[list[int], list[int]]:
 
 
 def morton_codes(cell: Codes) -> Codes:
-    """Interleave cells [N, 3], below 2^17 per axis, to Morton codes [N]."""
+    """Interleave cells [N, 3], below 2^17 per axis, to Morton codes [N]: bit 3 i + a is bit i along axis a."""
     bits = (((cell[:, a] >> i) & 1) << (3 * i + a) for i in range(POSITION_BITS) for a in range(3))
     return sum(bits, start=np.zeros(len(cell), np.int64))
 

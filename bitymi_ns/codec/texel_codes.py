@@ -23,8 +23,8 @@ BLOCK = 8  # largest side of a transformed block, texels
 GRADES = (-8, 24)  # range of a tile's grade: its step is the common one times 2^(grade / 2)
 RESIDUAL_STEP = 4.0 / 255  # step of mean residuals
 STEP = 7.5  # of coefficients, 8-bit steps, where nothing decides it
-LEAST_WEIGHT = 1e-3  # added to the weight of a texel, pixels, so that unseen texels stay near their values
-SPARSE_ROUNDS = 8  # ISTA iterations, which shrink coefficients that only unseen texels need
+LEAST_WEIGHT = 1e-3  # added to texel weights, pixels, so that unseen texels stay near their values
+SPARSE_ROUNDS = 8  # ISTA iterations
 ALPHA_GAIN = 6.0
 """Step of alphas relative to residual colours; at equal bytes 4 to 8 give the same PSNR."""
 SHRINK = 0.6  # soft threshold of an iteration relative to the step, for equally weighted texels
@@ -104,9 +104,7 @@ class TexelCodes:
     residual: npt.NDArray[np.int64]  # [N, 3] mean of each tile, or the constant: green, red - green, blue - green
     residual_step: float  # colour units
     grades: Tensor  # [tiles] int64
-    # per entry of `blocks_of(sizes)`: int32 [coefficients, B, 3], with channels (r + g + b) / sqrt(3),
-    # (r - b) / sqrt(2), (r - 2 g + b) / sqrt(6)
-    coefficients: Sequence[Tensor]
+    coefficients: Sequence[Tensor]  # per entry of `blocks_of(sizes)`: int32 [coefficients, B, 3], as in docs/baking.md
     alpha: AlphaCodes | None = None  # None = opaque texels
 
     @property
@@ -196,10 +194,9 @@ class TexelCoder:
     """Texel coder of fixed tiles, weighted by their coverage in the views."""
 
     def __init__(self, sizes: Tensor, weights: Tensor, step: float = STEP, first: TexelCodes | None = None) -> None:
-        """Take tiles of sides `sizes` [N, 2], (0, 0) = one constant, and texel weights [T], in the order of
-        `TexelTiles`: sum over views and fragments of the squared blending weight times the bilinear weight, so that a
-        texel error e adds weight times e^2 to the pictures. `step`: of a coefficient, in 8-bit steps, for texels that
-        cover one pixel of the views; step / sqrt(w) if w pixels. `first`: codes whose alphas and grades are kept."""
+        """Take tiles of sides `sizes` [N, 2], (0, 0) = one constant, and texel weights [T] (docs/baking.md), in the
+        order of `TexelTiles`. `step`: of a coefficient, in 8-bit steps, for texels of weight 1; step / sqrt(w) for
+        weight w. `first`: codes whose alphas and grades are kept."""
         self._sizes, self._weights = sizes.long(), weights + LEAST_WEIGHT
         self._step = step / 255
         self.blocks = blocks_of(self._sizes)

@@ -24,7 +24,7 @@ FLAT_LOG_SCALE = -16.0
 GRID = 24  # grid points per axis of a kernel, to sum moments under alpha texels
 LEAST_OPACITY = 1e-4  # of a surfel that alpha texels cut away
 HARD_BETA = 0.5658
-"""Exponent below which a disc approximates the kernel better than a Gaussian of equal moments, in squared error."""
+"""Exponent below which a disc approximates the kernel better than a Gaussian, in squared error."""
 FLAT = "SplatRenderMode: 2dgs"  # comment of a PLY file whose Gaussians have two scales, as Brush writes it
 _NAMES = {
     "means": ("x", "y", "z"),

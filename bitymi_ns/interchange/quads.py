@@ -42,10 +42,9 @@ def quads_of(scene: BakedScene, color: Tensor, level: float) -> Quads:
     """Convert the surfels of a scene on the CPU, with its texels decoded, to quads.
 
     A quad is the square around the disc in which the surfel's opacity o k = o (1 - r^2 / R^2)^beta is at least `level`,
-    in (0, 1); below it everywhere there is none. Alpha is 1 - r^2 / (2 radius^2), 0.5 at the rim of the disc. With
-    alpha texels m the opacity is o k m: the disc is that of the largest m, and alpha is at most o k m / (2 level).
-    Colours are max(color + residual, 0), with `color` [N, 3]. Texels are resampled from the surfel's tile, at about its
-    resolution, with the outer texel centres at the corners."""
+    in (0, 1). Alpha is 1 - r^2 / (2 radius^2), 0.5 at the disc's rim; with alpha texels m the disc is that of the
+    largest m, and alpha at most o k m / (2 level). Colours are max(color + residual, 0), with `color` [N, 3]. Texels
+    are resampled at about the tile's resolution, with the outer texel centres at the corners."""
     surfels = scene.surfels
     opacity = torch.sigmoid(surfels["opacity_logits"].double()) * _largest_alpha(scene)
     kept = torch.nonzero(opacity > level).squeeze(1)

@@ -25,9 +25,9 @@ def recolored(
 ) -> Quads:
     """Fit the texels of quads to renders of the scene, at the pixels where they are nearest.
 
-    A surfel is blended with what is behind it; an opaque quad is not. So each quad's colours are first shifted by
-    their mean difference from the renders, over its pixels; then each texel becomes the mean of its pixels. Both means
-    include the previous value with the weight of PRIOR pixels. `picture`: renders a view, [H, W, 3]."""
+    Each quad's colours are first shifted by their mean difference from the renders, over its pixels; then each texel
+    becomes the mean of its pixels. Both means include the previous value with the weight of PRIOR pixels. `picture`:
+    renders a view, [H, W, 3]."""
     pages, height, width, _ = quads.pages.shape
     shift, shown = torch.zeros(len(quads), 3), torch.zeros(len(quads), 1)
     texels, count = torch.zeros(pages * height * width, 3), torch.zeros(pages * height * width, 1)

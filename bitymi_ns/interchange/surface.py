@@ -23,19 +23,19 @@ from .triangles import Triangles, cleaned, solid
 if TYPE_CHECKING:
     import open3d
 
-HALF = 0.5  # accumulated weight at which the median depth is reached
+HALF = 0.5  # accumulated weight at the median depth
 TRUNCATION = 8.0  # truncation distance of the TSDF in voxels; with 4, walls with noisy depth get more holes
 SMOOTHING = 10  # iterations of Taubin smoothing
 QUANTILE = 0.01  # share of the observed points outside each side of the box
 REACH = 3.0
 """Maximum half side of the box, relative to the larger of the cameras' extent and the median depth of all views."""
-SMALLEST = 0.005  # components with less than this share of the triangles of the largest one are dropped
+SMALLEST = 0.005  # components with less than this share of the largest one's triangles are dropped
 BOX_SIDE = 160  # longer side in pixels of the depth maps that determine the box
 PIXELS_PER_VOXEL = 2.0
 """Pixels per voxel at far depths: finer depth maps do not improve the volume."""
 FAR = 0.9  # quantile of a view's depths in the box used as far depth
 SAMPLED = 4  # open3d looks for voxels at every fourth pixel of a depth map, and fails without any
-POISSON_DEPTH = 9  # depth of the octree of the watertight reconstruction
+POISSON_DEPTH = 9  # of the octree of the watertight reconstruction
 
 
 class NoSurface(ValueError):
@@ -77,8 +77,8 @@ def median_depth(surfels: Mapping[str, Tensor], camera: Camera, near: float, alp
 
 
 def observed_box(depths: Sequence[Tensor], cameras: Sequence[Camera]) -> Tensor:
-    """Compute the box [2, 3] around the points of depth maps, without the outermost `QUANTILE` at each side, within
-    `REACH` (above). Raises NoSurface: there are no cameras, or no pixel has a depth."""
+    """Compute the box [2, 3] around the points of depth maps, by `QUANTILE` and `REACH`. Raises NoSurface: there are no
+    cameras, or no pixel has a depth."""
     if not cameras:
         raise NoSurface("there are no cameras that see the surface")
     points = torch.cat([_points(depth, camera) for depth, camera in zip(depths, cameras, strict=True)])
@@ -110,9 +110,9 @@ def extract_surface(
     alpha: TexelAlpha | None = None,
     to: Similarity | None = None,
 ) -> Triangles:
-    """Fuse the median depths of views into a triangle mesh with vertex colors. `surfels`, `near`, `alpha`: as in
-    `median_depth`. `render`: renders the colors [H, W, 3] of a view. `to`: transform to the mesh's frame; None: the
-    scene's. Raises NoSurface: there is nothing to fuse. Raises ValueError: an option is out of range."""
+    """Fuse the median depths of views (`median_depth`) into a triangle mesh with vertex colors. `render`: renders the
+    colors [H, W, 3] of a view. `to`: transform to the mesh's frame; None: the scene's. Raises NoSurface: there is
+    nothing to fuse. Raises ValueError: an option is out of range."""
     import open3d
 
     options = options or SurfaceOptions()

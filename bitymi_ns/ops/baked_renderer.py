@@ -39,7 +39,7 @@ class Workspace:
     """Working memory of frames on a device; it grows as needed and is kept.
 
     Attributes:
-        capacity: pairs of surfel and screen tile that fit, for any distribution over the tiles.
+        capacity: pairs of surfel and screen tile that fit, however they are distributed.
         slots: per tile; 0 before the first frame.
         memory: [bytes] uint8; None before the first frame.
     """
@@ -83,11 +83,9 @@ class BakedRenderer:
     Args:
         scene: on a CUDA device.
         width, height: image size, pixels.
-        views: number of views per frame.
-        images: names of `IMAGES`: fewer images cost less.
-        background: [3] colour behind the scene; None: black.
+        views: per frame.
+        images, background, photo_pixel: as in `baked.draw`; fewer images cost less.
         graph: record the frame as a CUDA graph, which costs the host one call per frame. GPU only.
-        photo_pixel: as in `baked.draw`.
         workspace: not used elsewhere meanwhile; None: a new one.
 
     Raises:
@@ -130,16 +128,13 @@ class BakedRenderer:
     def draw(
         self, cameras: Sequence[CameraLike], check: bool = True, background: Tensor | None = None
     ) -> dict[str, Tensor]:
-        """Render the views.
+        """Render the views into `images`.
 
         Args:
             cameras: one per view, of the renderer's size.
             check: wait for the frame and render it again if the working memory was too small; False: only start it, and
                 call `complete` later.
             background: [3] new background colour, if the renderer has one; None: as before.
-
-        Returns:
-            name -> [views, height, width, channels]; the same memory every time.
 
         Raises:
             ValueError: the cameras do not match the renderer.

@@ -31,7 +31,8 @@ class DrawCache:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._sources: list[tuple[Any, int]] = []
+        self._sources: tuple[Tensor | str | None, ...] = ()
+        self._key: list[Any] = []
         self._atlas: Any = None
         self._coarser: Any = None
         self._workspaces: Pool[Any] | None = None
@@ -42,13 +43,11 @@ class DrawCache:
 
     def atlas(self, make: Callable[[], Any], *sources: Tensor | str | None) -> Any:
         """Return the atlas, made anew when a source was replaced or written to."""
-        now = [(t, version_of(t) if isinstance(t, Tensor) else 0) for t in sources]
+        key = [(id(t), version_of(t)) if isinstance(t, Tensor) else t for t in sources]
         with self._lock:
-            if len(now) != len(self._sources) or any(
-                a is not b and (isinstance(a, Tensor) or a != b) or version != before
-                for (a, version), (b, before) in zip(now, self._sources, strict=True)
-            ):
-                self._atlas, self._coarser, self._sources = make(), None, now
+            if key != self._key:
+                self._atlas, self._coarser, self._key = make(), None, key
+                self._sources = sources  # kept, so that no other tensor gets an id of the key
             return self._atlas
 
     def coarser(self, make: Callable[[], Any]) -> Any:

@@ -147,12 +147,7 @@ class BakedScene:
     ) -> dict[str, Tensor]:
         """Render at least one view, all of one size, in a batch on a CUDA device, with the same samples per pixel.
 
-        Args:
-            background: [3] colour behind the scene; None: black.
-            images: names of `ops.baked.IMAGES`.
-
-        Returns:
-            name -> [views, height, width, channels].
+        Arguments and images are those of `ops.baked.draw`.
 
         Raises:
             ValueError: the cameras differ in size or have skew, or views times surfels is above 2^24.

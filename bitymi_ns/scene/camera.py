@@ -74,8 +74,8 @@ class Camera:
         return (points[:, None] * viewmat[:3, :3]).sum(-1) + viewmat[:3, 3]
 
     def project(self, points: Tensor, near: float = 0.0) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Project world points [M, 3] to pixel coordinates x, y and camera z, each [M], and test if they are inside the
-        image and beyond the plane z = `near`, [M] bool; x and y are those of z clamped to it."""
+        """Project world points [M, 3] to pixel coordinates x, y and camera z, [M], and test if they are inside the
+        image and beyond z = `near`, [M] bool; x and y are those of z clamped to it."""
         x, y, z = self.local(points).unbind(-1)
         depth, K = z.clamp(min=near), self.K.to(points.dtype)
         x, y = K[0, 0] * x / depth + K[0, 2], K[1, 1] * y / depth + K[1, 2]

@@ -18,8 +18,8 @@ SMALLEST, LARGEST = 0.5, 2.0
 ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
 """Smallest scales with one sample per pixel, and with two along each axis."""
 SAMPLE = 0.58
-"""Minimum number of samples across a photograph's pixel at smaller scales, within the limits below. Coarser ones blur
-edges that the alpha texels of several surfels share: the mean transmittance of a stack is not the product of means."""
+"""Minimum number of samples across a photograph's pixel at smaller scales, within the limits below: coarser ones blur
+edges that the alpha texels of several surfels share."""
 MOST_SAMPLES, FEW_PIXELS = 6, 1 << 21  # maximum per pixel along each axis; more up to this number of samples in all
 MOST_PIXELS = 1 << 24  # maximum number of samples of a view
 FARTHEST = (1.0 / 64, 64.0)  # range of scales

@@ -1,4 +1,4 @@
-"""Visibility of surfels in the training views: views that blend them, and the transmittance in front of them."""
+"""Visibility of surfels in views: those that blend them, and the transmittance in front of them."""
 
 from __future__ import annotations
 
@@ -27,8 +27,7 @@ class Visibility:
     """Visibility of N surfels in the views.
 
     Attributes:
-        transmittance: [N] float32, maximum T over the surfel's blended fragments in all views (blending weight =
-            sigma T); 0 for a surfel that no view blends.
+        transmittance: [N] float32, maximum T over the surfel's blended fragments in all views; 0 without any.
         pixels: [N] float32, maximum over the views of the sum of the surfel's blending weights that get a residual.
         squares: [V, N] bfloat16, sum over the view's pixels of the surfel's squared blending weight: a colour error e
             adds e^2 times this to the squared error.

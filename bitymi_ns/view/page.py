@@ -73,8 +73,8 @@ class Site:
 
     @cached_property
     def policy(self) -> str:
-        """Content-Security-Policy of all responses: that of the page, without frames. Nothing in a bundle can run:
-        scripts come only from the page, and a bundle's files are never sent as scripts."""
+        """Content-Security-Policy of all responses: that of the page, without frames. Nothing in a bundle can run, as
+        its files are never sent as scripts."""
         found = _POLICY.search(self.files["index.html"]()) if "index.html" in self.files else None
         return f"{found[1].decode() if found else NOTHING}; frame-ancestors 'none'"
 
@@ -83,8 +83,7 @@ class Site:
         return object() if path == _NOTES else None if self.bundle is None else self.bundle.stamp()
 
     def read(self, path: str) -> bytes | bytearray:
-        """Read one of `paths`. Raises BundleError: a file of the bundle is missing, altered, or a link out of the
-        bundle."""
+        """Read one of `paths`. Raises BundleError: as `Shown.read`."""
         if path == _NOTES:
             notes = self.notes()
             if notes is None:

@@ -21,7 +21,7 @@ from bitymi_ns.plugin.console import InputError
 from bitymi_ns.plugin.export.trained import load_trained, world_of
 from bitymi_ns.plugin.run import folder_lock
 from bitymi_ns.plugin.run.folder_lock import POSES
-from tests.captures import colmap_model, found_poses, printed
+from tests.captures import colmap_model, edit, found_poses, printed
 from tests.e2e.conftest import small_run
 from tests.e2e.exports import run_export
 from tests.e2e.runs import a_run_of, checkpoint, config_of, different, rewrite
@@ -174,29 +174,24 @@ def test_a_resumed_run_goes_on_in_the_same_world(shoot: Callable[..., Shot]) -> 
 def test_options_for_poses_not_found_anew(shoot: Callable[..., Shot], capsys: Printed) -> None:
     shot = shoot(sfm=SfmSettings(mapper="global", max_features=500))
 
-    def go_on(name: str, sfm: SfmSettings) -> str:
+    def go_on(name: str, sfm: SfmSettings, used: SfmSettings) -> str:
         config = small_run(shot.photographs, shot.outputs, name)
         config.load_dir = shot.config.get_checkpoint_dir()
         config.pipeline.datamanager.dataparser.sfm = sfm
         capsys.readouterr()
         config.set_timestamp()
-        assert config.pipeline.datamanager.dataparser.sfm == SfmSettings(mapper="global", max_features=500)
+        assert config.pipeline.datamanager.dataparser.sfm == used
         return printed(capsys)
 
-    for same in (SfmSettings(), SfmSettings(mapper="global"), SfmSettings(mapper="global", max_features=500)):
-        assert "--sfm" not in go_on("same", same)
-    text = go_on("other", SfmSettings(mapper="incremental", max_features=500, frames=7))
+    given = SfmSettings(mapper="global", max_features=500)
+    for same in (SfmSettings(), SfmSettings(mapper="global"), given):
+        assert "--sfm" not in go_on("same", same, given)
+    text = go_on("other", SfmSettings(mapper="incremental", max_features=500, frames=7), given)
     assert "--sfm.mapper incremental and --sfm.frames 7 are not used" in text and "leave out --load-dir" in text
     assert str(shot.run / POSES) in text
     origin = shot.run / POSES / "origin.json"
-    values = json.loads(origin.read_text())
-    del values["origin"]["settings"]  # as in earlier versions
-    origin.write_text(json.dumps(values))
-    config = small_run(shot.photographs, shot.outputs, "earlier")
-    config.load_dir = shot.config.get_checkpoint_dir()
-    config.pipeline.datamanager.dataparser.sfm = SfmSettings(frames=7)
-    config.set_timestamp()
-    assert "--sfm.frames 7 is not used" in printed(capsys)
+    edit(origin, lambda values: values["origin"].pop("settings"))  # as in earlier versions
+    assert "--sfm.frames 7 is not used" in go_on("earlier", SfmSettings(frames=7), SfmSettings(frames=7))
 
 
 def test_a_run_that_goes_on_in_its_own_folder(shoot: Callable[..., Shot]) -> None:

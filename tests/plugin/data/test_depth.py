@@ -21,7 +21,7 @@ from bitymi_ns.capture.types import CaptureError, ColmapCamera
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager
 from bitymi_ns.sample.capture import RoomView, first_hits, generate
 from bitymi_ns.sample.room import Room
-from tests.captures import expect, load, refused
+from tests.captures import edit_frames, expect, load, refused
 
 WIDTH, HEIGHT = 64, 48
 
@@ -43,24 +43,29 @@ def write_exr(path: Path, **channels: np.ndarray) -> None:
     OpenEXR.File({"compression": OpenEXR.PIZ_COMPRESSION, "type": OpenEXR.scanlineimage}, channels).write(str(path))
 
 
+def write_map(path: Path, values: np.ndarray) -> None:
+    if path.suffix == ".npy":
+        np.save(path, values)
+    elif path.suffix == ".npz":
+        np.savez_compressed(path, values)
+    elif path.suffix == ".exr":
+        write_exr(path, Y=values)
+    else:
+        assert cv2.imwrite(str(path), values)
+
+
 @pytest.fixture
 def capture(room, tmp_path):
     """write(function of the depth of a frame, ...) -> the capture with those maps."""
     folder, depths = room
 
-    def write(change=lambda z, i: z, ending: str = ".npy", points: bool = True, **entries) -> Path:
+    def write(change=lambda z, i: z, ending: str = ".npy", points: bool = True) -> Path:
         meta = json.loads((folder / "transforms.json").read_text())
         for i, (frame, depth) in enumerate(zip(meta["frames"], depths, strict=True)):
             frame["file_path"] = str(folder / frame["file_path"])
             frame["depth_file_path"] = f"depth_{i}{ending}"
-            values = change(depth, i)
-            if ending == ".npy":
-                np.save(tmp_path / frame["depth_file_path"], values)
-            elif ending == ".exr":
-                write_exr(tmp_path / frame["depth_file_path"], Y=values)
-            else:
-                assert cv2.imwrite(str(tmp_path / frame["depth_file_path"]), values)
-        meta |= {"ply_file_path": str(folder / meta["ply_file_path"]), **entries}
+            write_map(tmp_path / frame["depth_file_path"], change(depth, i))
+        meta["ply_file_path"] = str(folder / meta["ply_file_path"])
         if not points:
             del meta["ply_file_path"]
         (tmp_path / "transforms.json").write_text(json.dumps(meta))
@@ -245,10 +250,7 @@ def test_an_exr_file_whose_header_lacks_something_is_one_message(tmp_path: Path)
 def test_a_damaged_map_is_one_message(tmp_path, ending, capfd) -> None:
     """OpenCV prints lines of its own by default; OpenEXR always. Found by scripts/fuzz.py."""
     file = tmp_path / f"a{ending}"
-    if ending == ".exr":
-        write_exr(file, Y=np.ones((64, 64), np.float32))
-    else:
-        assert cv2.imwrite(str(file), np.ones((64, 64), np.float32))
+    write_map(file, np.ones((64, 64), np.float32))
     data = bytearray(file.read_bytes())
     data[len(data) // 2 :] = bytes(len(data) - len(data) // 2)
     file.write_bytes(data)
@@ -272,14 +274,7 @@ def test_maps_that_are_no_files(tmp_path, name) -> None:
 def test_maps_of_every_kind_are_read(tmp_path, ending) -> None:
     values = np.arange(1.0, 64 * 64 + 1.0).reshape(64, 64).astype(np.uint16 if ending == ".png" else np.float32)
     file = tmp_path / f"a{ending}"
-    if ending == ".npy":
-        np.save(file, np.asfortranarray(values))
-    elif ending == ".npz":
-        np.savez_compressed(file, values)
-    elif ending == ".exr":
-        write_exr(file, Y=values)
-    else:
-        assert cv2.imwrite(str(file), values)
+    write_map(file, np.asfortranarray(values) if ending == ".npy" else values)
     read = read_depth(MapFiles(file), LENS, 1.0)
     assert np.array_equal(read, values)
 
@@ -304,10 +299,7 @@ def test_missing_maps_and_switching_off(capture, capsys) -> None:
     assert sum(view.depth is None for view in views) == 1
     off = load(folder, depth="off")
     assert all(view.depth is None for view in off.train_views)
-    meta = json.loads((folder / "transforms.json").read_text())
-    for frame in meta["frames"]:
-        del frame["depth_file_path"]
-    (folder / "transforms.json").write_text(json.dumps(meta))
+    edit_frames(folder, lambda frame: frame.pop("depth_file_path"))
     without = load(folder)
     for a, b in zip(off.train_views, without.train_views, strict=True):
         assert a.depth is None and b.depth is None and torch.equal(a.image, b.image)
@@ -319,21 +311,16 @@ def test_missing_maps_and_switching_off(capture, capsys) -> None:
 
 def test_normals_of_a_capture(capture, room, capsys) -> None:
     folder = capture()
-    meta = json.loads((folder / "transforms.json").read_text())
-    for i, frame in enumerate(meta["frames"]):
-        frame["normal_file_path"] = f"normal_{i}.png"
-        normal = np.zeros((HEIGHT, WIDTH, 3)) + (0.0, 0.6, 0.8)  # x right, y up, z back
-        image = np.round((normal + 1.0) / 2.0 * 255).astype(np.uint8)
-        image[:5] = 0
-        cv2.imwrite(str(folder / frame["normal_file_path"]), image[..., ::-1])
-    (folder / "transforms.json").write_text(json.dumps(meta))
+    normal = np.zeros((HEIGHT, WIDTH, 3)) + (0.0, 0.6, 0.8)  # x right, y up, z back
+    image = np.round((normal + 1.0) / 2.0 * 255).astype(np.uint8)
+    image[:5] = 0
+    cv2.imwrite(str(folder / "normal.png"), image[..., ::-1])
+    edit_frames(folder, lambda frame: frame.update(normal_file_path="normal.png"))
     manager = load(folder)
     normal = manager.train_views[0].normal.float()
     assert normal.shape == (HEIGHT, WIDTH, 3) and not normal[:5].any()
     torch.testing.assert_close(normal[20, 20], torch.tensor([0.0, -0.6, -0.8]), atol=0.01, rtol=0)
-    for i in range(16):
-        image = cv2.imread(str(folder / f"normal_{i}.png"))
-        cv2.imwrite(str(folder / f"normal_{i}.png"), 255 - image)
+    cv2.imwrite(str(folder / "normal.png"), 255 - image[..., ::-1])
     load(folder)
     assert "face away from the camera" in " ".join(capsys.readouterr().out.split())
 

@@ -17,8 +17,7 @@ from tests.captures import expect
 
 
 def load(capture: Path, longest_side: int) -> BitymiDataManager:
-    parser = BitymiDataParserConfig()
-    config = BitymiDataManagerConfig(data=capture, dataparser=parser, longest_side=longest_side)
+    config = BitymiDataManagerConfig(data=capture, dataparser=BitymiDataParserConfig(), longest_side=longest_side)
     return config.setup(device="cpu", test_mode="val")
 
 

@@ -1,31 +1,15 @@
 """Poses that are not rotations, and cameras far from the others."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, rotations
-from tests.captures import edit, load, printed
+from tests.captures import load, printed
+from tests.changes import matrices, pose
 from tests.typed import Printed
-
-
-def pose_of(frame: dict[str, Any]) -> np.ndarray:
-    return np.array(frame["transform_matrix"])
-
-
-def change_poses(capture: Path, change: Any, only: int | None = None) -> None:
-    """Apply `change` to the 3 x 3 parts of all poses, or of one."""
-
-    def apply(meta: dict[str, Any]) -> None:
-        for frame in meta["frames"] if only is None else [meta["frames"][only]]:
-            pose = pose_of(frame)
-            pose[:3, :3] = change(pose[:3, :3])
-            frame["transform_matrix"] = pose.tolist()
-
-    edit(capture, apply)
 
 
 def test_rounded_matrices_are_taken(capsys: Printed) -> None:
@@ -41,10 +25,10 @@ def test_rounded_matrices_are_taken(capsys: Printed) -> None:
 
 
 def test_a_mirrored_capture_is_taken_and_a_mirrored_frame_is_named(capture: Path, capsys: Printed) -> None:
-    change_poses(capture, lambda part: part * [-1, 1, 1])
+    matrices(lambda pose: pose * [-1, 1, 1, 1])(capture)
     c2w = load(capture).train_dataset.cameras.camera_to_worlds
     assert (torch.linalg.det(c2w[:, :, :3]) < 0).all() and "mirrored against the other" not in printed(capsys)
-    change_poses(capture, lambda part: part * [-1, 1, 1], only=3)
+    pose(lambda part: part * [-1, 1, 1])(capture)
     load(capture)
     assert "images/frame_00004.png is mirrored against the other frames" in (message := printed(capsys))
     assert message.count("mirrored against") == 1

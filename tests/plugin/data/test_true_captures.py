@@ -15,7 +15,8 @@ from bitymi_ns.capture.colmap_model import read_model
 from bitymi_ns.plugin.data.datamanager import BitymiDataManager, BitymiDataManagerConfig
 from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.plugin.export.trained import world_of
-from tests.captures import edit, edit_frames, expect, images_of, load_any, printed, save_masks, write_cloud
+from tests.captures import edit, expect, images_of, load_any, printed, save_masks, write_cloud
+from tests.changes import matrices
 from tests.formats import JSON, PHOTOGRAPHS, Form, blender, colmap, instant_ngp, nerfstudio
 from tests.typed import Printed
 
@@ -46,12 +47,7 @@ def move(place: Path, shift: np.ndarray) -> None:
             row[1:4] = map(str, np.array(row[1:4], float) + shift)
         (place / "points3D.txt").write_text("".join(" ".join(row) + "\n" for row in rows))
         return
-
-    def change(frame: dict[str, Any]) -> None:
-        for row, by in zip(frame["transform_matrix"], shift, strict=False):
-            row[3] += by
-
-    edit_frames(place, change)
+    matrices(lambda pose: pose + np.outer([*shift, 0.0], [0.0, 0.0, 0.0, 1.0]))(place)
     write_cloud(place.parent / "sparse_pc.ply", np.array([[0, 0, 0.5], [0.1, 0, 0.5]]) + shift)
 
 
@@ -260,12 +256,7 @@ def test_millimetres_where_the_format_has_no_scale(capture: Path, form: Form, ca
     path = form(capture)
     load_any(capture)
     assert "of this format usually lie" not in printed(capsys)
-
-    def change(frame: dict[str, Any]) -> None:
-        for row in frame["transform_matrix"][:3]:
-            row[3] *= 1000.0
-
-    edit_frames(path, change)
+    matrices(lambda pose: pose + np.outer(pose[:, 3] * [999, 999, 999, 0], [0, 0, 0, 1]))(path)
     manager = load_any(capture)
     assert "units from their middle, where those of this format usually lie" in (text := printed(capsys))
     assert "they are scaled by 0.0" in text

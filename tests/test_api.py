@@ -90,15 +90,6 @@ def test_rasterize_agrees_with_the_float64_reference(most: int, monkeypatch: pyt
         bitymi_ns.rasterize(**(values | {"quats": values["quats"][:, :3]}), camera=camera)
 
 
-def flat(**changes: float) -> dict[str, torch.Tensor]:
-    values = {"opacities": 0.7, "betas": 2.0, **changes}
-    numbers = {name: torch.tensor([value]) for name, value in values.items() if name in ("opacities", "betas")}
-    scales = torch.full((1, 2), values.get("scales", 0.5))
-    place = {"means": torch.tensor([[0.0, 0.0, 4.0]]), "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]])}
-    found = {**place, "scales": scales, **numbers, "colors": torch.ones(1, 3)}
-    return {name: value.requires_grad_() for name, value in found.items()}
-
-
 @pytest.mark.parametrize("cuda", [False, pytest.param(True, marks=EMULATED)])
 @pytest.mark.parametrize(("dtype", "error"), [(torch.float64, 1e-9), (torch.float32, 1e-5)])
 def test_the_ends_of_the_ranges_have_values_and_gradients_of_the_float64_reference(
@@ -142,8 +133,9 @@ def test_the_ends_of_the_ranges_have_values_and_gradients_of_the_float64_referen
     ],
 )
 def test_what_is_out_of_range_is_refused(name: str, value: float, message: str) -> None:
+    values = surfels()
     with pytest.raises(ValueError, match=message):
-        bitymi_ns.rasterize(**flat(**{name: value}), camera=camera_of())
+        bitymi_ns.rasterize(**values | {name: torch.full_like(values[name], value)}, camera=camera_of())
 
 
 def test_what_cannot_be_trained_or_baked_is_refused(tmp_path: Path) -> None:

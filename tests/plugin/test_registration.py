@@ -19,11 +19,10 @@ from bitymi_ns.plugin import hooks, methods
 from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
 from bitymi_ns.presets import preset_dir
 from bitymi_ns.train import preset
+from tests.plugin.run.test_preset import METHODS
 
-NAMES = ["bitymi", *(f"bitymi-{name}" for name in ("quality", "fast", "sb", "sg", "sh", "field", "notexture"))]
 
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", METHODS)
 def test_every_method_is_registered_under_its_name(name: str) -> None:
     specification = getattr(methods, name.replace("-", "_"))
     assert isinstance(specification, MethodSpecification)

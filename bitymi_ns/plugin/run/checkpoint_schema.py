@@ -144,17 +144,17 @@ def check_entries(state: Mapping[str, Any], scene: SceneConfig) -> dict[str, Ten
         if not part.name.endswith(EXTRA_STATE):
             part.tensor(dtype=None)
     extra = pipeline[f"_model.{EXTRA_STATE}"]
-    if (near := extra.get("near")) is not None:
+    if near := extra.get("near"):
         near.number(1e-30, 1e30)
     for name, low in (("first_surfels", 0), ("trained_for", 1)):
-        if (count := extra.get(name)) is not None:
+        if count := extra.get(name):
             count.count(low)
-    if (options := extra.get("train")) is not None:
+    if options := extra.get("train"):
         try:
             Entry(json_of(options.text()), options.name).table()
         except ValueError as error:
             raise Misfit(f"{options.name} has to be a table of options as JSON") from error
-    if (run := extra.get("run")) is not None and run.table():
+    if (run := extra.get("run")) and run.table():
         _check_run(run, rows, step)
     for entry in (root["optimizers"], root.get("schedulers"), root.get("scalers")):
         if entry is not None:
@@ -235,9 +235,9 @@ def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:
 
 
 def _check_run(run: Entry, rows: int, step: int) -> None:
-    if (length := run.get("max_steps")) is not None:
+    if length := run.get("max_steps"):
         length.count(1)
-    if (start := run.get("texels_start")) is not None:
+    if start := run.get("texels_start"):
         start.number(0, step)
         start.count()
     strategy = run["strategy"]
@@ -255,30 +255,30 @@ def _check_run(run: Entry, rows: int, step: int) -> None:
             torch.Generator().set_state(numbers)
         except RuntimeError as error:
             raise Misfit(f"{state.name} is no state of a random generator") from error
-    if (sizes := run.get("step_sizes")) is not None:
+    if sizes := run.get("step_sizes"):
         footprints = sizes["footprints"].tensor(None)
         if len(footprints) not in (0, rows) or not bool((footprints > 0).all()):
             sizes["footprints"].refuse(f"float32 [{rows}], above 0")
-    if (guard := run.get("guard")) is not None:
+    if guard := run.get("guard"):
         for name in ("factor", "limit", "sum"):
             guard[name].number()
         for name in ("rollbacks", "count"):
             guard[name].count()
     for name in ("seconds", "cpu_seconds"):
         run[name].number(0.0, 1e12)
-    if (capture := run.get("capture")) is not None:
+    if capture := run.get("capture"):
         capture["views"].count()
         capture["names"].text()
         capture["poses"].text()
-    if (poses := run.get("poses")) is not None and (motions := poses.get("motions")) is not None:
+    if (poses := run.get("poses")) and (motions := poses.get("motions")):
         if not bool((motions.tensor(None, 6, dtype=torch.float64).abs() <= LARGEST).all()):
             motions.refuse("finite")
-    if (exposure := run.get("exposure")) is not None:
+    if exposure := run.get("exposure"):
         exposure["kind"].text()
         exposure["finding"].text()
         if not isinstance(exposure["decided"].value, bool):
             exposure["decided"].refuse("true or false")
-        if (table := exposure.get("table")) is not None:
+        if table := exposure.get("table"):
             columns = table.tensor(None, None).shape[1]
             if columns not in (3, 12):
                 table.refuse("float32 [any, 3] or [any, 12]")

@@ -18,10 +18,7 @@ HEADER = (
     "ply\nformat {}\ncomment by hand\nelement vertex {}\n"
     "property float x\nproperty short y\nproperty char z\nproperty double w\n{}end_header\n"
 )
-BINARY = "binary_little_endian 1.0"
-
-
-TEXT = "ascii 1.0"
+BINARY, TEXT = "binary_little_endian 1.0", "ascii 1.0"
 
 
 def write(path: Path, body: bytes, format: str = BINARY, count: object = 3, further: str = "", ahead: str = "") -> Path:

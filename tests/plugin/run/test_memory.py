@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import psutil
 import pytest
@@ -50,9 +51,8 @@ def gigabytes(text: str) -> float:
     return math.sqrt(float(low or high) * float(high))
 
 
-@pytest.mark.parametrize("what", ["training", "export"])
-def test_a_line_says_what_is_taken(scene: Drawn, what: str, monkeypatch: Patch, capsys: Printed) -> None:
-    state = {"training": memory.state_training, "export": memory.state_export}[what]
+@pytest.mark.parametrize("state", [memory.state_training, memory.state_export])
+def test_a_line_says_what_is_taken(scene: Drawn, state: Any, monkeypatch: Patch, capsys: Printed) -> None:
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=10**12))
     state(scene[0], [scene[1]] * 20, 0)
     text = said(capsys)
@@ -82,16 +82,15 @@ class OnCard:
         return self._count
 
 
-@pytest.mark.parametrize("what", ["training", "export"])
-def test_a_card_has_its_own_memory(scene: Drawn, what: str, monkeypatch: Patch, capsys: Printed) -> None:
-    state = {"training": memory.state_training, "export": memory.state_export}[what]
+@pytest.mark.parametrize("state", [memory.state_training, memory.state_export])
+def test_a_card_has_its_own_memory(scene: Drawn, state: Any, monkeypatch: Patch, capsys: Printed) -> None:
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=0))  # host memory is irrelevant
     monkeypatch.setattr(memory, "photograph_budget", lambda device: 2**30)
-    monkeypatch.setattr(memory, "PER_SURFEL" if what == "training" else "PER_PIXEL", 1e8)
+    monkeypatch.setattr(memory, "PER_SURFEL" if state is memory.state_training else "PER_PIXEL", 1e8)
     needed = []
     for free in (10**12, 10**9):
         monkeypatch.setattr(memory, "free_memory", lambda device, free=free: free)
-        state(OnCard(scene[0]), [scene[1]] * 20, 0)  # type: ignore[operator]
+        state(OnCard(scene[0]), [scene[1]] * 20, 0)
         text = said(capsys)
         assert "GB of memory of the GPU for 20 training photographs" in text
         assert ("more than the 1.0 GB that the GPU has available" in text) == (free == 10**9)

@@ -93,7 +93,7 @@ def test_unusable_places_are_found_early(trained: Run, tmp_path: Path, monkeypat
     monkeypatch.setattr(target, "free_bytes", lambda path: 34_500)
     with pytest.raises(
         InputError,
-        match=r"too little room .*: 34.5 kB are free, .* up to \d.* MB, by a generous estimate.*--check-room False",
+        match=r"may take up to \d.* MB, by a generous estimate, and 34.5 kB are free.*--check-room False",
     ):
         run_export(trained, tmp_path / "b")
     with pytest.raises(TypeError):  # raised by the work, which is reached

@@ -67,8 +67,7 @@ def print_summary(folder: Path, baked: Coded, info: Manifest, target_mb: float |
             table.add_row(f"{name} against photographs", fit)
     CONSOLE.print(table)
     if target_mb is not None and size < _MUCH_SMALLER * 1e6 * target_mb:
-        more = "with more, the training photographs are shown no better by 0.01 dB."
-        say(f"{size / 1e6:.2f} MB suffice, of the {target_mb:g} MB that were asked for: {more}")
+        say(f"{size / 1e6:.2f} MB suffice, of the {target_mb:g} MB that were asked for: more gain less than 0.01 dB.")
     say(f"Evaluate it with: ns-eval --load-config {shlex.quote(str(folder / 'config.yml'))}")
 
 

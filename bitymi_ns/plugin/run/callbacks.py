@@ -136,9 +136,8 @@ class TrainingRun:
         empty = [dataset.image_filenames[i] for i in views_without_surfels(self.scene, cameras)]
         if len(empty) == len(dataset):
             fail(
-                f"none of the {len(self.scene):,} points that training starts from lies in any training view. Either "
-                "the point cloud is in another frame than the poses, or the cameras look the other way (nerfstudio's "
-                "axes are x right, y up, z back)."
+                f"none of the {len(self.scene):,} initial points lies in any training view: they are in another frame "
+                "than the poses, or the cameras look the other way (nerfstudio's axes are x right, y up, z back)."
             )
         if empty:
             warn(f"{listed(empty)} sees no initial point: the pose may be wrong, or the point cloud has none there.")

@@ -89,10 +89,7 @@ def read_camera_path(file: Path) -> CameraPath:
         where, what = first_problem(error)
         fail(f"the camera path {file} cannot be used: {where + ': ' if where else ''}{what}. {HELP}", error)
     if path.camera_type.lower() not in ("perspective", "pinhole"):
-        fail(
-            f"the camera path {file} is for {path.camera_type} cameras: choose perspective ones in the viewer's render "
-            "tab and save it again."
-        )
+        fail(f"the camera path {file} is for {path.camera_type} cameras: save it again with perspective ones.")
     widest = max(frame.fov for frame in path.camera_path)
     if widest < math.pi:
         radians = f"If radians were meant, fov has to be {math.degrees(widest):.3g}."

@@ -90,8 +90,7 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
     except Misfit as error:
         fail(f"the checkpoint {path} was altered, or is not of this method: {error}. {way_out}.", error)
     if broken:
-        where = f"holds numbers that are not finite, or too large to be drawn, in {listed(broken)}"
-        warn(f"The checkpoint {path} {where}: expect holes, or black.")
+        warn(f"The checkpoint {path} holds numbers that are not finite, or too large to be drawn, in {listed(broken)}.")
     return state
 
 

@@ -229,8 +229,7 @@ def new_scene(
         warn(f"The capture has only {usable} different points. If little appears, start without (ply_file_path).")
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
-        what = f"{report.not_finite} of {report.given} points of the capture are NaN or infinite"
-        warn(f"{what} (the first is point {row}); they are left out.")
+        warn(f"{report.not_finite} of {report.given} points of the capture are not finite and left out, first {row}.")
     return scene
 
 
@@ -239,7 +238,7 @@ def _corners(scene_box: SceneBox) -> Tensor:
     low, high = corners
     if not bool(torch.isfinite(corners).all()) or not bool((high > low).all()):
         fail(
-            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it in its files; "
-            "in nerfstudio's own format give a point cloud, or a positive --scene-scale after `nerfstudio-data`."
+            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it; in nerfstudio's "
+            "format give a point cloud, or a positive --scene-scale after `nerfstudio-data`."
         )
     return corners

@@ -82,10 +82,7 @@ def check_options(command: Any) -> None:
             between = f"from {low:g} to {high:,}" if high < math.inf else f"at least {low:g}"
             fail(f"--{name.replace('_', '-')} must be {between}, not {value}.")
     if command.render_nearest_camera or command.check_occlusions:
-        fail(
-            "--render-nearest-camera and --check-occlusions need rays: leave them out. `ns-render dataset` writes "
-            "photographs beside renders."
-        )
+        fail("--render-nearest-camera and --check-occlusions need rays: leave them out.")
     _check_outputs(command, not as_film and command.image_format == "png")
     dataset = not hasattr(command, "output_format")
     if not dataset and not Path(command.output_path).name:
@@ -137,10 +134,7 @@ def _check_outputs(command: Any, transparency: bool) -> None:
 def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
     """Make nerfstudio's path between cameras, in the first one's size, with principal points interpolated."""
     if len(cameras) < 2:
-        fail(
-            f"a path needs two cameras, and there is {'only one' if len(cameras) else 'none'}. Choose --pose-source "
-            "train, or `ns-render spiral`."
-        )
+        fail(f"a path needs two cameras, not {len(cameras)}: --pose-source train has more, or use `ns-render spiral`.")
     path = stock(cameras=cameras, **options)
     points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
     along = stock(cameras=points, **options)  # in the fields of focal lengths

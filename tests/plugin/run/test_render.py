@@ -258,7 +258,7 @@ BAD_PATHS = {
     "seconds: Input should be a finite number": lambda p: p.update(seconds=math.inf),
     "makes 12000 frames per second: correct its seconds": lambda p: p.update(seconds=0.001),
     "render_height: Input should be less than or equal to 16384": lambda p: p.update(render_height=100_000),
-    "for equirectangular cameras: choose perspective": lambda p: p.update(camera_type="equirectangular"),
+    "for equirectangular cameras: save it again": lambda p: p.update(camera_type="equirectangular"),
 }
 
 
@@ -291,7 +291,7 @@ def test_files_without_camera_path(wall: Wall, camera_path: Any, tmp_path: Path,
     with pytest.raises(InputError, match="path.json cannot be used: Input should be .*dictionary"):
         camera_path([1, 2])
     monkeypatch.setattr(HeldOut, "count", 1)
-    with pytest.raises(InputError, match="there is only one. Choose --pose-source train"):
+    with pytest.raises(InputError, match="two cameras, not 1: --pose-source train"):
         render.RenderInterpolated(load_config=tmp_path / "c.yml", output_path=tmp_path / "film.mp4").main()
 
 

@@ -24,8 +24,8 @@ def check_room(folder: Path, load_config: Path, options: BakeOptions, exact: boo
     needed, free = space_needed(load_config, options, exact), free_bytes(folder)
     if free < needed:
         fail(
-            f"{folder} may take up to {size_text(needed)}, by a generous estimate, and {size_text(free)} are free: free "
-            "more, give an --output-dir on another disk, or try --check-room False."
+            f"{folder} may take up to {size_text(needed)}, by a generous estimate, and {size_text(free)} are free: "
+            "free more, give an --output-dir on another disk, or try --check-room False."
         )
 
 

@@ -238,7 +238,7 @@ def _corners(scene_box: SceneBox) -> Tensor:
     low, high = corners
     if not bool(torch.isfinite(corners).all()) or not bool((high > low).all()):
         fail(
-            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it; in nerfstudio's "
-            "format give a point cloud, or a positive --scene-scale after `nerfstudio-data`."
+            f"the scene box of the capture, from {low.tolist()} to {high.tolist()}, is empty. Correct it; in "
+            "nerfstudio's format give a point cloud, or a positive --scene-scale after `nerfstudio-data`."
         )
     return corners

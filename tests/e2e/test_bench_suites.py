@@ -18,16 +18,12 @@ SMALL = (
 )  # fmt: skip
 
 
-def colmap_scene(room: Path, folder: Path) -> None:
-    """Write the room as COLMAP would, with images at half the size that COLMAP saw."""
+@pytest.mark.slow
+def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "360/bonsai"  # as COLMAP would write it, with images at half the size that COLMAP saw
     colmap_model(room, folder / "sparse/0")
     (folder / "sparse/0/cameras.txt").write_text("1 PINHOLE 96 72 80 80 48 36\n")
     shutil.copytree(room / "images", folder / "images_2")
-
-
-@pytest.mark.slow
-def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path) -> None:
-    colmap_scene(room, tmp_path / "360" / "bonsai")
     (scene,) = standard_scenes("mipnerf360", tmp_path / "360", ["bonsai"])
     run, work = Cell(**vars(scene), method="bitymi", options=SMALL, seed=3, steps=2), tmp_path / "work"
     run_measured(train_command(work, run), tmp_path / "log")  # its end is in the message if it fails
@@ -37,7 +33,7 @@ def test_a_scene_of_mipnerf360(room: Path, tmp_path: Path) -> None:
     assert config.machine.seed == config.pipeline.model.train.seed == 3
     assert config.pipeline.datamanager.train_cameras_sampling_seed == 3
     held_out = [name.name for name in pipeline.datamanager.eval_dataset.image_filenames]
-    every = sorted(p.name for p in (tmp_path / "360/bonsai/images_2").iterdir())
+    every = sorted(path.name for path in (folder / "images_2").iterdir())
     assert held_out == every[::8]
     camera, batch = pipeline.datamanager.eval_view(0)
     assert batch["image"].shape[:2] == (36, 48) == (int(camera.height), int(camera.width))

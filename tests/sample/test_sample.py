@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -15,36 +16,33 @@ from bitymi_ns.sample.room import HIGH, LANDSCAPE, LOW, SOLIDS, Room
 VIEWS, WIDTH, HEIGHT = 12, 160, 120
 
 
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return generate(tmp_path_factory.mktemp("sample") / "room", views=VIEWS, width=WIDTH, height=HEIGHT, points=3000)
+class Capture(NamedTuple):
+    folder: Path
+    meta: dict[str, Any]
+    images: np.ndarray  # [VIEWS, HEIGHT, WIDTH, 3]
+    points: np.ndarray  # [M, 3]
+    colors: np.ndarray  # [M, 3] in [0, 1]
 
 
 @pytest.fixture(scope="module")
-def meta(capture: Path) -> dict:
-    return json.loads((capture / "transforms.json").read_text())
-
-
-@pytest.fixture(scope="module")
-def images(capture: Path, meta: dict) -> np.ndarray:
-    return np.stack([np.asarray(Image.open(capture / frame["file_path"])) for frame in meta["frames"]])
-
-
-@pytest.fixture(scope="module")
-def cloud(capture: Path) -> tuple[np.ndarray, np.ndarray]:
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     import open3d
 
-    ply = open3d.io.read_point_cloud(str(capture / "sparse_pc.ply"))
-    return np.asarray(ply.points), np.asarray(ply.colors)
+    folder = tmp_path_factory.mktemp("sample") / "room"
+    generate(folder, views=VIEWS, width=WIDTH, height=HEIGHT, points=3000)
+    meta = json.loads((folder / "transforms.json").read_text())
+    images = np.stack([np.asarray(Image.open(folder / frame["file_path"])) for frame in meta["frames"]])
+    cloud = open3d.io.read_point_cloud(str(folder / "sparse_pc.ply"))
+    return Capture(folder, meta, images, np.asarray(cloud.points), np.asarray(cloud.colors))
 
 
-def test_files(capture: Path, meta: dict, images: np.ndarray, cloud: tuple[np.ndarray, np.ndarray]) -> None:
-    names = [frame["file_path"] for frame in meta["frames"]]
+def test_files(capture: Capture) -> None:
+    names = [frame["file_path"] for frame in capture.meta["frames"]]
     assert names[::11] == ["images/frame_00001.png", "images/frame_00012.png"]
-    assert images.shape == (VIEWS, HEIGHT, WIDTH, 3)
-    assert (meta["w"], meta["h"]) == (WIDTH, HEIGHT)
-    assert cloud[0].shape == (3000, 3)
-    assert sorted(path.name for path in capture.parent.iterdir()) == ["room"], "nothing is left beside it"
+    assert capture.images.shape == (VIEWS, HEIGHT, WIDTH, 3)
+    assert (capture.meta["w"], capture.meta["h"]) == (WIDTH, HEIGHT)
+    assert capture.points.shape == (3000, 3)
+    assert sorted(path.name for path in capture.folder.parent.iterdir()) == ["room"], "nothing is left beside it"
 
 
 def project(meta: dict, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -56,41 +54,34 @@ def project(meta: dict, frame: int, points: np.ndarray) -> tuple[np.ndarray, np.
         return meta["cx"] + meta["fl_x"] * p[:, 0] / depth, meta["cy"] - meta["fl_y"] * p[:, 1] / depth, depth
 
 
-def test_points_have_the_color_of_the_pixels_they_fall_on(
-    meta: dict, images: np.ndarray, cloud: tuple[np.ndarray, np.ndarray]
-) -> None:
-    points, colors = cloud
+def test_points_have_the_color_of_the_pixels_they_fall_on(capture: Capture) -> None:
+    points, colors = capture.points, capture.colors
     room, path = Room(0), camera_path(VIEWS, WIDTH, HEIGHT, 0)
     agree, total = 0, 0
     for k in range(VIEWS):
-        x, y, depth = project(meta, k, points)
+        x, y, depth = project(capture.meta, k, points)
         index = np.flatnonzero((depth > 0) & (x >= 1) & (x < WIDTH - 1) & (y >= 1) & (y < HEIGHT - 1))
-        x, y = x[index], y[index]
-        flat = y.astype(int) * WIDTH + x.astype(int)
-        seen, _, surfaces = first_hits(room, path[k], flat)
+        x, y = x[index].astype(int), y[index].astype(int)
+        seen, _, surfaces = first_hits(room, path[k], y * WIDTH + x)
         near = np.linalg.norm(seen - points[index], axis=1) < 0.03 * depth[index]
         plain = near & (surfaces != SPHERE)
         # 3 x 3 pixels, as a point may fall on the edge of a pattern
-        best = np.full(len(index), np.inf)
-        for dy in (-1, 0, 1):
-            for dx in (-1, 0, 1):
-                pixel = images[k][y.astype(int) + dy, x.astype(int) + dx] / 255.0
-                best = np.minimum(best, np.abs(pixel - colors[index]).max(axis=1))
+        pixels = [capture.images[k][y + dy, x + dx] / 255.0 for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+        best = np.abs(pixels - colors[index]).max(axis=2).min(axis=0)
         agree += int((best[plain] < 0.1).sum())
         total += int(plain.sum())
     assert total > 3000, "points are seen by several views"
     assert agree >= 0.9 * total, f"{agree} of {total}"
 
 
-def test_own_view_reproduces_the_points_exactly(meta: dict, cloud: tuple[np.ndarray, np.ndarray]) -> None:
+def test_own_view_reproduces_the_points_exactly(capture: Capture) -> None:
     """Points were drawn view by view; the first ones lie on pixel centres of the first view."""
-    x, y, _ = project(meta, 0, cloud[0][: 3000 // VIEWS])
-    assert np.abs(x - np.floor(x) - 0.5).max() < 2e-3
-    assert np.abs(y - np.floor(y) - 0.5).max() < 2e-3
+    for position in project(capture.meta, 0, capture.points[: 3000 // VIEWS])[:2]:
+        assert np.abs(position - np.floor(position) - 0.5).max() < 2e-3
 
 
-def test_cameras_stand_in_the_room_upright_and_clear(meta: dict) -> None:
-    for frame in meta["frames"]:
+def test_cameras_stand_in_the_room_upright_and_clear(capture: Capture) -> None:
+    for frame in capture.meta["frames"]:
         matrix = np.array(frame["transform_matrix"])
         assert np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-12)
         assert np.linalg.det(matrix[:3, :3]) > 0
@@ -111,9 +102,7 @@ def test_sphere_mirrors() -> None:
 
     def seen(eye: list[float], point: np.ndarray) -> np.ndarray:
         d = point - np.array(eye)
-        d = np.float32(d / np.linalg.norm(d))[:, None]
-        o = np.float32(eye)[:, None]
-        return room.color(o, d)[0]
+        return room.color(np.float32(eye)[:, None], np.float32(d / np.linalg.norm(d))[:, None])[0]
 
     a, b = [-1.5, -1.8, 1.2], [0.6, -1.9, 0.9]
     angles = np.linspace(-0.5, 1.3, 12)

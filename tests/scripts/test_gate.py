@@ -8,32 +8,40 @@ from typing import Any
 
 import pytest
 
-
-@pytest.fixture
-def gate(load: Callable[[str], ModuleType]) -> ModuleType:
-    return load("gate")
-
-
 GOOD = {
     "psnr_trained": 20.0, "psnr_baked": 21.0, "lpips_baked": 0.1, "bundle_bytes": 1000.0, "surfels": 100.0,
     "fragments_per_pixel": 10.0, "peak_mb": 500.0, "train": 80.0, "bake": 40.0, "frame": 0.5,
 }  # fmt: skip
 
 
-def run(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, baseline: Path, *measured: Any, accept: bool = False) -> int:
-    """Run the gate on given measurements; returns how many it used."""
-    left = [{**GOOD, **change} for change in measured]
-    monkeypatch.setattr(gate, "measure", lambda *_: left.pop(0))
-    gate.main(baseline=baseline, accept=accept)
-    return len(measured) - len(left)
+Run = Callable[..., int]
 
 
-def test_equal_and_better_pass(gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    baseline = tmp_path / "gate.json"
-    run(gate, monkeypatch, baseline, {}, accept=True)
+@pytest.fixture
+def baseline(tmp_path: Path) -> Path:
+    return tmp_path / "gate.json"
+
+
+@pytest.fixture
+def run(load: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch, baseline: Path) -> Run:
+    """Return a function that runs the gate on measurements with changes of GOOD, the baseline, and returns how many it
+    used."""
+    gate = load("gate")
+
+    def measured(*changes: dict[str, float], accept: bool = False) -> int:
+        left = [{**GOOD, **change} for change in changes]
+        monkeypatch.setattr(gate, "measure", lambda: left.pop(0))
+        gate.main(baseline=baseline, accept=accept)
+        return len(changes) - len(left)
+
+    measured({}, accept=True)
+    return measured
+
+
+def test_equal_and_better_pass(run: Run, baseline: Path) -> None:
     assert json.loads(baseline.read_text())["figures"]["psnr_trained"] == 20.0
-    assert run(gate, monkeypatch, baseline, {}) == 1
-    assert run(gate, monkeypatch, baseline, {"psnr_trained": 25.0, "bundle_bytes": 10.0, "train": 1.0}) == 1
+    assert run({}) == 1
+    assert run({"psnr_trained": 25.0, "bundle_bytes": 10.0, "train": 1.0}) == 1
 
 
 @pytest.mark.parametrize(
@@ -51,33 +59,24 @@ def test_equal_and_better_pass(gate: ModuleType, monkeypatch: pytest.MonkeyPatch
         ("frame", 0.57, 0.58),
     ],
 )
-def test_each_limit(
-    gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, figure: str, passes: Any, fails: Any, capsys: Any
-) -> None:
-    baseline = tmp_path / "gate.json"
-    run(gate, monkeypatch, baseline, {}, accept=True)
-    run(gate, monkeypatch, baseline, {figure: passes})
+def test_each_limit(run: Run, figure: str, passes: float, fails: float, capsys: Any) -> None:
+    run({figure: passes})
     with pytest.raises(SystemExit, match="1 of 10 figures are worse"):
-        run(gate, monkeypatch, baseline, {figure: fails}, {figure: fails})
+        run({figure: fails}, {figure: fails})
     assert capsys.readouterr().out.count("WORSE") == 1
 
 
-def test_times_are_taken_again_and_not_judged_elsewhere(
-    gate: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    baseline = tmp_path / "gate.json"
-    run(gate, monkeypatch, baseline, {}, accept=True)
-    assert run(gate, monkeypatch, baseline, {"train": 200.0}, {}) == 2
+def test_times_are_taken_again_and_not_judged_elsewhere(run: Run, baseline: Path) -> None:
+    assert run({"train": 200.0}, {}) == 2
     with pytest.raises(SystemExit, match="1 of 10"):
-        run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_trained": 21.0}, {"train": 120.0})
+        run({"train": 200.0, "psnr_trained": 21.0}, {"train": 120.0})
     stated = json.loads(baseline.read_text())
     baseline.write_text(json.dumps({**stated, "processor": "another one"}))
-    assert run(gate, monkeypatch, baseline, {"train": 200.0, "psnr_trained": 19.91}) == 1
-    with pytest.raises(SystemExit, match="1 of 10"):
-        run(gate, monkeypatch, baseline, {"psnr_trained": 19.89})
-    with pytest.raises(SystemExit, match="1 of 10"):
-        run(gate, monkeypatch, baseline, {"surfels": 200.0})
+    assert run({"train": 200.0, "psnr_trained": 19.91}) == 1
+    for worse in ({"psnr_trained": 19.89}, {"surfels": 200.0}):
+        with pytest.raises(SystemExit, match="1 of 10"):
+            run(worse)
     stated["settings"]["steps"] += 1
     baseline.write_text(json.dumps(stated))
     with pytest.raises(SystemExit, match="the baseline is of"):
-        run(gate, monkeypatch, baseline, {})
+        run({})

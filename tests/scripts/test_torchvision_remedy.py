@@ -65,20 +65,21 @@ NMS = "RuntimeError: operator torchvision::nms does not exist"
 
 
 @pytest.mark.parametrize(
-    ("errors", "status", "left"),
-    [([""], 0, 0), ([NMS, ""], 0, 2), ([NMS, "still broken"], 1, 0), (["ImportError: something else"], 1, 0)],
+    ("prefix", "errors", "status", "left"),
+    [
+        ("elsewhere", [""], 0, 0),
+        ("elsewhere", [NMS, ""], 0, 2),
+        ("elsewhere", [NMS, "still broken"], 1, 0),
+        ("elsewhere", ["ImportError: something else"], 1, 0),
+        (sys.prefix, [], 2, 0),  # no virtual environment
+    ],
 )
 def test_files_are_written_when_needed_and_taken_back(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, errors: Any, status: int, left: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, prefix: str, errors: Any, status: int, left: int
 ) -> None:
     answers, files = iter(errors), (tmp_path / "shim.py", tmp_path / "shim.pth")
     monkeypatch.setattr(remedy, "shim_files", lambda: files)
     monkeypatch.setattr(remedy, "import_error", lambda: next(answers))
-    monkeypatch.setattr(sys, "base_prefix", "elsewhere")
+    monkeypatch.setattr(sys, "base_prefix", prefix)
     assert remedy.main() == status
     assert len(list(tmp_path.iterdir())) == left
-
-
-def test_refuses_outside_a_virtual_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "base_prefix", sys.prefix)
-    assert remedy.main() == 2

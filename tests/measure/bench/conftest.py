@@ -12,21 +12,24 @@ from bitymi_ns.measure.bench.matrix import Chain, Row, Scene, chains
 from tests.bake.conftest import make_surfels
 from tests.bundle.made import make
 
-FAKE = """#!{python} -SE
+FAKE = """
 import json, os, pathlib, sys, time
 
 def given(name):
     return sys.argv[sys.argv.index(name) + 1]
 
-name = pathlib.Path(sys.argv[0]).name
+def named(file):
+    lines = (here / file).read_text().splitlines()
+    return any(line and all(word in call for word in line.split()) for line in lines)
+
+here, name = pathlib.Path(sys.argv[0]).parent, pathlib.Path(sys.argv[0]).name
 call = " ".join([name, *sys.argv[1:]])
-with open({log!r}, "a") as log:
+with open(here / "log", "a") as log:
     log.write(call + "\\n")
-for line in pathlib.Path({plan!r}).read_text().splitlines():
-    if line and all(word in call for word in line.split()):
-        print("something is wrong with the capture")
-        sys.exit(3)
-while any(all(word in call for word in line.split()) for line in pathlib.Path({slow!r}).read_text().splitlines()):
+if named("fail"):
+    print("something is wrong with the capture")
+    sys.exit(3)
+while named("slow"):
     time.sleep(0.05)
 print(os.environ["OMP_WAIT_POLICY"])
 if name == "ns-train":
@@ -40,8 +43,7 @@ if name == "ns-train":
 elif name == "ns-export":
     bundle = pathlib.Path(given("--output-dir"))
     bundle.mkdir(parents=True)
-    written = pathlib.Path({bundles!r}, given("--format"))
-    (bundle / "bundle.json").write_text((written / "bundle.json").read_text())
+    (bundle / "bundle.json").write_text((here / "bundles" / given("--format") / "bundle.json").read_text())
     (bundle / "config.yml").write_text("config")
 elif name == "ns-eval":
     assert pathlib.Path(given("--load-config")).is_file()
@@ -61,9 +63,9 @@ class Fakes:
         self.log, self.plan, self.slow = files = [folder / name for name in ("log", "fail", "slow")]
         for file in files:
             file.write_text("")
-        paths = {"log": str(self.log), "plan": str(self.plan), "slow": str(self.slow), "bundles": str(bundles)}
+        (folder / "bundles").symlink_to(bundles)
         for name in ("ns-train", "ns-export", "ns-eval"):
-            (folder / name).write_text(FAKE.format(python=sys.executable, **paths))
+            (folder / name).write_text(f"#!{sys.executable} -SE{FAKE}")
             (folder / name).chmod(0o755)
 
     def calls(self) -> list[str]:
@@ -103,6 +105,11 @@ def fakes(bundles: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Fak
     folder.mkdir()
     monkeypatch.setattr("bitymi_ns.measure.bench.engine.tool", lambda name: str(folder / name))
     return Fakes(folder, bundles)
+
+
+@pytest.fixture
+def work(tmp_path: Path) -> Path:
+    return tmp_path / "work"
 
 
 @pytest.fixture

@@ -22,8 +22,7 @@ def lines(work: Path) -> list[dict]:
     return [json.loads(line) for line in (work / "cells.jsonl").read_text().splitlines()]
 
 
-def test_every_cell_is_a_line_and_is_not_run_again(fakes, matrix: list[Chain], tmp_path: Path) -> None:
-    work = tmp_path / "work"
+def test_every_cell_is_a_line_and_is_not_run_again(fakes, matrix: list[Chain], work: Path) -> None:
     assert run_chains(work, matrix) == []
     cells = lines(work)
     assert len(cells) == 16 and len({identity(c["key"]) for c in cells}) == 16
@@ -52,9 +51,9 @@ def test_every_cell_is_a_line_and_is_not_run_again(fakes, matrix: list[Chain], t
 
 @pytest.mark.parametrize("at", [0, 2, 3])
 def test_a_kill_costs_one_cell(
-    fakes, matrix: list[Chain], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: int
+    fakes, matrix: list[Chain], work: Path, monkeypatch: pytest.MonkeyPatch, at: int
 ) -> None:
-    work, chain = tmp_path / "work", matrix[0]
+    chain = matrix[0]
     calls = iter(range(99))
 
     def killed(command: list[str], log: Path, lock: Lock) -> object:
@@ -77,9 +76,9 @@ def test_a_kill_costs_one_cell(
 
 @pytest.mark.slow
 def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
-    fakes, matrix: list[Chain], capture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    fakes, matrix: list[Chain], work: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    work, python = tmp_path / "work", fakes.python(monkeypatch)
+    python = fakes.python(monkeypatch)
     words = [python, "-m", "bitymi_ns", "bench", "local", "--data", matrix[0][0].data, "--steps", "10"]
     words += ["--formats", "bc7", "--work", str(work)]
     fakes.slow.write_text("ns-export")
@@ -111,9 +110,9 @@ def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
     ],
 )
 def test_what_depends_on_a_missing_cell_is_done_again(
-    fakes, matrix: list[Chain], tmp_path: Path, kept: list[int], again: list[str]
+    fakes, matrix: list[Chain], work: Path, kept: list[int], again: list[str]
 ) -> None:
-    work, chain = tmp_path / "work", matrix[0]
+    chain = matrix[0]
     run_chains(work, [chain])
     fakes.calls()
     text = (work / "cells.jsonl").read_text().splitlines(keepends=True)
@@ -124,8 +123,7 @@ def test_what_depends_on_a_missing_cell_is_done_again(
     assert {identity(c["key"]) for c in lines(work)} == {identity(s.key) for s in chain}
 
 
-def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: list[Chain], tmp_path: Path) -> None:
-    work = tmp_path / "work"
+def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: list[Chain], work: Path) -> None:
     fakes.fail("ns-train captures/fox", "ns-export /lego/ -seed1")
     failures = run_chains(work, matrix)
     assert len(failures) == 3
@@ -139,18 +137,18 @@ def test_a_failure_is_told_and_the_rest_goes_on(fakes, matrix: list[Chain], tmp_
     assert len(fakes.calls()) == 8 + 2
 
 
-def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: list[Chain], tmp_path: Path) -> None:
+def test_a_command_that_leaves_nothing_is_a_failure(fakes, matrix: list[Chain], work: Path) -> None:
     (fakes.folder / "ns-eval").write_text("#!/bin/sh\nexit 0\n")
-    (failure, *_) = run_chains(tmp_path / "work", matrix[:1])
+    (failure, *_) = run_chains(work, matrix[:1])
     assert "evaluation (trained)" in failure and "cannot be read: it does not exist" in failure
 
 
-def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: list[Chain], tmp_path: Path) -> None:
+def test_methods_of_others_are_trained_and_evaluated_only(fakes, matrix: list[Chain], work: Path) -> None:
     scene = Scene("fox", matrix[0][0].data)
     other = chains([scene], {"splatfacto": Row(method="splatfacto")}, {"bc7": ()}, (), 100)
-    assert run_chains(tmp_path / "work", other) == []
+    assert run_chains(work, other) == []
     assert [call.split()[0] for call in fakes.calls()] == ["ns-train", "ns-eval"]
-    (cell, _) = lines(tmp_path / "work")
+    (cell, _) = lines(work)
     assert "seconds" not in cell["value"] and cell["value"]["process_seconds"] >= 0
 
 

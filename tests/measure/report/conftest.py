@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from bitymi_ns.measure.report.page import build, compose, to_page
-from bitymi_ns.measure.report.records import Records
+from bitymi_ns.measure.report.records import Evaluation, Records, evaluation_from
 
 RUNS = {
     ("fox", "bitymi"): (27.413, 18_942),
@@ -29,6 +29,11 @@ def evaluation(scene: str, method: str, **results: float) -> dict:
     results = {"lpips": math.nan, "num_rays_per_sec": 81_234.5, "fps": 0.63, **results}
     spread = {f"{key}_std": abs(value) * 0.04 for key, value in results.items()}
     return {"experiment_name": scene, "method_name": method, "results": results | spread}
+
+
+def make(scene: str = "fox", method: str = "bitymi", source: str = "a/eval.json", **results: float) -> Evaluation:
+    data = {"experiment_name": scene, "method_name": method, "results": results}
+    return evaluation_from(data, Path(source))
 
 
 def view(path: Path, index: int, noise: float, phase: float) -> None:
@@ -131,10 +136,7 @@ def eval_json(tmp_path: Path):
     """Return a function that writes an evaluation and returns its path."""
 
     def write(name: str = "eval.json", scene: str = "fox", method: str = "bitymi", **results):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(evaluation(scene, method, **results)))
-        return path
+        return write_lines(tmp_path / name, [evaluation(scene, method, **results)])
 
     return write
 

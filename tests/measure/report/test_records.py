@@ -7,13 +7,8 @@ from pathlib import Path
 import pytest
 
 from bitymi_ns.measure.report.read import collect, read_jsonl
-from bitymi_ns.measure.report.records import Records, ReportError, evaluation_from, link, over_seeds
-from tests.measure.report.conftest import cell, figures, write_lines
-
-
-def make(scene="fox", method="bitymi", source="a/eval.json", **results):
-    data = {"experiment_name": scene, "method_name": method, "results": results}
-    return evaluation_from(data, Path(source))
+from bitymi_ns.measure.report.records import Records, ReportError, link, over_seeds
+from tests.measure.report.conftest import cell, figures, make, write_lines
 
 
 def test_nan_and_infinity_tokens_are_missing_values(tmp_path: Path):
@@ -63,16 +58,6 @@ def test_lines_with_results_are_evaluations(tmp_path: Path):
     path.write_text('{"step": 5, "experiment_name": "fox", "method_name": "m", "results": {"psnr": 20}}\n')
     read = read_jsonl(path)
     assert read.evaluations[0].results == {"psnr": 20.0} and not read.curves
-
-
-def test_results_folder(results: Path, tmp_path: Path):
-    records = collect([results], tmp_path / "report")
-    assert len(records.evaluations) == 16 and sum(e.baked for e in records.evaluations) == 12
-    assert {(c.scene, c.label) for c in records.curves} == {
-        (scene, method) for scene in ("fox", "snowmiku") for method in ("bitymi", "bitymi-quality")
-    }
-    assert len(records.images) == 29
-    assert len(records.notes) == 1
 
 
 def test_namesakes_get_different_labels(eval_json, tmp_path: Path):
@@ -128,7 +113,6 @@ def test_runs_that_differ_in_length_are_told_apart(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
-        ("{}", "line 2, is not a finished cell"),
         ('{"key": {"cell": "eval"}, "value": {}}', "the entry 'scene' is missing"),
         ('{"key": {"cell": "eval", "scene": "a", "row": "b"}, "value": {}}', "the entry 'results' is missing"),
         (

@@ -1,16 +1,9 @@
 """Tables: present columns, bold values, differences, means."""
 
-from pathlib import Path
-
-from bitymi_ns.measure.report.records import Records, evaluation_from, link
+from bitymi_ns.measure.report.records import Records, link
 from bitymi_ns.measure.report.tables import COLUMNS, FITTED, Row, Table, quality_tables, to_markdown
-from tests.measure.report.conftest import page_of
+from tests.measure.report.conftest import make, page_of
 from tests.view.browser import drive, plain_server
-
-
-def make(scene="fox", method="bitymi", source="a/eval.json", **results):
-    data = {"experiment_name": scene, "method_name": method, "results": results}
-    return evaluation_from(data, Path(source))
 
 
 def test_layout_before_and_after_baking():

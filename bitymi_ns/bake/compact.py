@@ -40,10 +40,10 @@ _CLOSE = 1.1  # largest ratio of the bytes of an alternative to those wanted, or
 class Compact:
     """Size and precision of a compact bundle.
 
-    `share`: what may be added, before the texels are tuned, to the mean square error against the training photographs,
-    as a share of it; less where lambda would exceed `MAX_LAMBDA`. Instead decide, where given, `most_bytes` of surfels
-    and texels, not used up where the added error is below `ENOUGH`, or `psnr`, dB, which the smallest bundle must reach
-    before the texels are tuned. `views`: number of training views that are drawn."""
+    `share`: added error before the texels are tuned, as a share of the mean square error against the training
+    photographs; less where lambda would exceed `MAX_LAMBDA`. Instead decide, where given, `most_bytes` of surfels and
+    texels, not used up where the added error is below `ENOUGH`, or `psnr`, dB, of the smallest bundle before the texels
+    are tuned. `views`: number of training views that are drawn."""
 
     share: float = 0.1
     most_bytes: int | None = None

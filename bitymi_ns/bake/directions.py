@@ -34,9 +34,9 @@ class Directions:
 def view_directions(means: Tensor, seen: Tensor, centers: Tensor) -> Iterator[Directions]:
     """Yield the directions of all surfels, in chunks that about equally many views see.
 
-    A surfel has the directions of the views that see it and BETWEEN others: random points of triangles between three of
-    these, enlarged by a quarter, with the same random numbers for every surfel. A surfel that no view sees has SPHERE
-    directions. `means`: [N, 3], `centers`: [V, 3] float64 of the cameras, world. `seen`: [V, N] bool."""
+    A surfel has the directions of the views that see it and BETWEEN random points of triangles of three of these,
+    enlarged by a quarter; one that no view sees has SPHERE directions. `means`: [N, 3], `centers`: [V, 3] float64 of
+    the cameras, world. `seen`: [V, N] bool."""
     count = seen.sum(0)  # [N]
     order = torch.argsort(count, stable=True)
     unseen = int((count == 0).sum())

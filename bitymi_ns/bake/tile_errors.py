@@ -1,5 +1,5 @@
-"""Errors of texels as the closest training view shows them: times the blending weight, averaged over each pixel; and
-the certificate of a bake, which states those of quantisation."""
+"""Errors of texels as the closest training view shows them, times the blending weight and averaged over each pixel, and
+the certificate of those of quantisation."""
 
 from collections.abc import Mapping, Sequence
 from itertools import chain

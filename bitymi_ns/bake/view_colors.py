@@ -89,16 +89,12 @@ def color_choices(
     near: float = 0.0,
     progress: Progress = no_progress,
 ) -> ColorChoices:
-    """Fit view colours from one colour up to the fewest terms within a tolerance; returned on the CPU.
+    """Fit view colours from one colour up to the fewest terms within a tolerance (docs/baking.md); returned on the CPU.
 
     The tolerance bounds the error of max(f_view + 0.5, 0), the largest over directions (`view_directions`) and
-    channels, times the largest blending weight. One colour is tried first, the middle between the extremes; then 2, 3,
-    ... sites: those that are hardest to do without, fitted together by least squares. Kinds without sites
-    (`ViewColor.sites`) have one colour, or all terms.
-
-    Every choice has its squared error in the pictures, weighted by what the views show of the surfel (`squares`): half
-    of the weight lies on their directions, half on directions between and around them. Directions of the nearest other
-    views are added (`_unseen`). Sites are fitted to this error.
+    channels, times the largest blending weight. Kinds without sites have one colour, or all terms. Every choice has its
+    squared error in the pictures, weighted by what the views show of the surfel (`squares`) in their directions,
+    between and around them (`_weights`), and from the nearest other views (`_unseen`).
 
     Args:
         surfels: parameters, N rows; their device does the work.
@@ -169,7 +165,7 @@ def _weights(chunk: Directions, weights: Tensor) -> Tensor:
 def _unseen(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tuple[Tensor, Tensor]:
     """Find the directions [n, BLIND, 3] from the nearest views that do not show a surfel, as a new view near there may,
     and their weights [n, BLIND]: a share of the mean weight of the views that show it, scaled by the inverse square of
-    the distance; 0 without such a view. `means` [n, 3], `weights` [V, n] of the views, `centers` [V, 3] float64."""
+    the distance; 0 without such a view."""
     offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
     square, shows = offset.square().sum(2).clamp(min=near * near), weights.T > 0
     from_unit = (weights.T * square).sum(1) / shows.sum(1).clamp(min=1)

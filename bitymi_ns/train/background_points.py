@@ -38,9 +38,9 @@ class BackgroundPoints(NamedTuple):
 def background_points(points: Tensor, views: Sequence[View], seed: int) -> BackgroundPoints:
     """Sample points behind the cells of the photographs that no sparse point projects to.
 
-    A cell's point lies on the ray of a random pixel in it, at a log-uniform depth (`NEAREST`, `FARTHEST`). Masked and
-    transparent cells get none. A point is kept if enough photographs (`SUPPORT`) have it in an empty cell for training
-    to determine its depth, and few in front of a cell's points.
+    A point lies on the ray of a random pixel of its cell, at a log-uniform depth. Masked and transparent cells get
+    none. It is kept if enough photographs have it in an empty cell (`SUPPORT`), and few in front of points
+    (`IN_FRONT`).
 
     Args:
         points: [M, 3] world positions; those that are not finite are ignored.

@@ -1,8 +1,7 @@
 """Exposure and white balance of the training photographs: a learned colour correction per photograph.
 
-A photograph maps the scene's colour c to gain * c, with a gain per channel, or to matrix @ c + offset. After every step
-log gains and other entries are shifted to sum to zero over the photographs, so that they do not tint the scene. A free
-camera shows the mean exposure; `Exposure.at` interpolates that of a held-out photograph.
+A photograph maps the scene's colour c to gain * c, with a gain per channel, or to matrix @ c + offset. Log gains and
+other entries sum to zero over the photographs, so that they do not tint the scene: a free camera shows the mean.
 """
 
 import math

@@ -77,10 +77,8 @@ def surfels_from_points(
     """Initialise surfel parameters from sparse points.
 
     A surfel has scale `neighbour_distance`, its normal towards the nearest camera, a random in-plane rotation, and its
-    point's colour from every direction. Points that are duplicate or not finite are dropped. Without a usable point,
-    `config.random_points` surfels are sampled in `box`. Of more points than `config.densify.max_surfels` or
-    `config.first_surfels` a random subset is used. Background points are appended as far as `config.background_points`
-    and `config.densify.max_surfels` allow.
+    point's colour from every direction. Duplicate points and those that are not finite are dropped; of more than the
+    options allow, a random subset is used. Without a usable point, `config.random_points` surfels are sampled in `box`.
 
     Args:
         xyz: [M, 3] world positions; M may be 0.

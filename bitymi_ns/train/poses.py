@@ -1,18 +1,13 @@
 """Refinement of the training poses together with the scene.
 
-A photograph's pose takes a Gauss-Newton step whenever it is rendered, with the gradient with respect to rigid motions
-(`ops.project`). The L1 loss rises with the absolute gradient a_i of each projected centre and levels off within about a
-pixel, which gives the curvature. With the Jacobian J_i [2, 6] of the centre in pixels,
+A photograph's pose takes a Gauss-Newton step whenever it is rendered (docs/training.md, Poses). The L1 loss rises with
+the absolute gradient a_i of each projected centre and levels off within about a pixel, which gives the curvature:
 
-    step = -pixels (sum J_i^T a_i J_i)^-1 gradient
+    step = -pixels (sum J_i^T a_i J_i)^-1 gradient,   J_i [2, 6] Jacobian of the centre in pixels
 
-moves the image by `pixels` if all fragments agree on the direction, else by less.
-
-A common similarity of all cameras changes no image once the scene follows. It is projected out of every step, so that
-the scene stays in the capture's frame.
-
-Neighbouring photographs share the pose errors of structure from motion: cameras without a training photograph get the
-corrections of the nearest ones.
+moves the image by `pixels` if all fragments agree on the direction, else by less. A common similarity of all cameras is
+projected out, so that the scene stays in the capture's frame. Neighbouring photographs share the pose errors of
+structure from motion: other cameras get the corrections of the nearest ones.
 """
 
 from __future__ import annotations

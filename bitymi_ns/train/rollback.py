@@ -1,8 +1,7 @@
 """Rollback of diverged training to the last good state, with lower learning rates.
 
-Divergence is a field or too many surfels that are not finite, or a window of steps whose mean photometric loss exceeds
-that of images of constant mean colour and that of the initial scene. Losses from an opacity reset until opacities have
-recovered do not count. The step count continues.
+Divergence is a field or too many surfels that are not finite, or a window of steps, without those that recover from an
+opacity reset, whose mean photometric loss exceeds that of images of their mean colour and of the initial scene.
 """
 
 from __future__ import annotations

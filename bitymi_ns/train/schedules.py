@@ -100,11 +100,8 @@ class Schedule:
         return frozenset(step for step in steps if step <= last)
 
     def reset_opacity(self) -> float:
-        """Compute the opacity after a reset: `reset_opacity`, or more with resets less than about 370 steps apart.
-
-        Adam moves a logit by at most its learning rate per step: a reset lowers opacities only as far as they can
-        recover in half the time to the next one. Otherwise final prunes of a short run would remove nearly all.
-        """
+        """Compute the opacity after a reset: `reset_opacity`, or as much as lets opacities recover in half the time to
+        the next reset, as Adam moves a logit by at most its learning rate per step."""
         densify = self.config.densify
         deepest = max(-500.0, -0.5 * self.reset_every * self.lr("opacity_logits", 0))  # exp() overflows beyond
         return max(densify.reset_opacity, 1.0 / (1.0 + math.exp(-deepest)))
@@ -163,13 +160,9 @@ class Schedule:
         return 2.0 ** -sum(step < doubling for doubling in self._doublings)
 
     def _image_doublings(self, pixels: float) -> list[int]:
-        """List the steps from which the image size is doubled, `resolution_schedule` apart.
-
-        Short runs with a texel stage stretch that interval by `short_run_gain`: smaller images teach the surfels as
-        much at a lower cost. Three limits: images of few `pixels` would show too little (square root of these over
-        `small_photograph`); longer runs learn more than small images show (less stretch from about 1,850 steps on, none
-        from `PATIENT_STEPS` on); the texel stage needs full size.
-        """
+        """List the steps from which the image size is doubled, `resolution_schedule` apart. Short runs with a texel
+        stage stretch that interval: smaller images teach the surfels as much at a lower cost. Limits: images of few
+        `pixels` show too little, longer runs learn more than small images show, the texel stage needs full size."""
         apart, count = self.config.resolution_schedule, self.config.num_downscales
         if apart <= 0 or count <= 0:
             return []

@@ -1,16 +1,5 @@
-"""FastGS densification and pruning by multi-view scores, with the thresholds of `config.DensifyConfig`.
-
-At each densification, in this order:
-- surfels that can never be visible again are removed (a parameter that is not finite, an opacity of 1/255 or less);
-- surfels with many bad pixels and a large gradient are cloned or split, the most important first if there is a limit.
-  With `max_surfels` the number instead grows to that value in equal increments: parents are sampled in proportion to
-  gradient times bad pixels, and faint surfels are replaced if there are more parents than the increment;
-- up to half of the candidates for pruning, sampled at random, are removed;
-- opacities are clamped.
-
-After the last densification, surfels whose removal hardly changes the images are pruned; four final prunes do the same
-among faint surfels. docs/training.md states the published rules.
-"""
+"""FastGS densification and pruning by multi-view scores, with the thresholds of `config.DensifyConfig`; rules and their
+differences from the published ones: docs/training.md, Strategy and schedules."""
 
 from __future__ import annotations
 
@@ -288,7 +277,7 @@ class Strategy:
         return {"pruned": int(pruned.sum())}
 
     def _drop_dead(self) -> dict[str, float]:
-        """Remove surfels that can never be visible again, and the faintest beyond `max_surfels`."""
+        """Remove surfels that are not finite or can never be visible again, and the faintest beyond `max_surfels`."""
         scene, surfels = self.scene, self.scene.surfels
         if scene.field is not None and not all(bool(p.isfinite().all()) for p in scene.field.parameters()):
             raise TrainingDiverged(f"the texture field is broken: {describe_broken(scene.field)}")

@@ -1,5 +1,6 @@
 """Borders of index ranges: faces of hash cells, edges of atlas pages."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -48,21 +49,15 @@ def test_points_exactly_on_the_faces_of_hash_cells(dtype: torch.dtype, backend: 
         assert (a.double().cpu() - b).abs().max() < 5 * tolerance * b.abs().max()
 
 
-def page_edges(width: int, height: int, r_u: int, r_v: int) -> list[tuple[int, int]]:
-    """List the corners and edge middles of a page where a tile can lie."""
-    right, bottom = width - r_u, height - r_v
-    return [
-        (x, y) for y in (0, bottom // 2, bottom) for x in (0, right // 2, right) if (x, y) != (right // 2, bottom // 2)
-    ]
-
-
 @pytest.mark.parametrize("sides", [(4, 4), (8, 4), (4, 16)])
 def test_atlas_tiles_at_every_page_edge(sides: tuple[int, int], backend: Backend) -> None:
     """Texels outside tiles are NaN, so a stray fetch shows. Texture units fetch neighbours with weight 0 at the outer
     texel centres, where 0 times NaN would show; for them it is a large number."""
     r_u, r_v = sides
     width, height, layers = 64, 48, 3
-    places = [(x, y, layer) for layer in range(layers) for x, y in page_edges(width, height, r_u, r_v)]
+    right, bottom = width - r_u, height - r_v
+    corners_and_middles = itertools.product((0, right // 2, right), (0, bottom // 2, bottom), range(layers))
+    places = [place for place in corners_and_middles if place[:2] != (right // 2, bottom // 2)]
     n = len(places)
     case = front_scene(n, 1, 48, 36)
     case.params["log_scales"].fill_(math.log(0.3))
@@ -102,13 +97,7 @@ def test_pixels_at_the_edges_of_wide_and_tall_images_are_drawn(backend: Backend)
         f = float(max(width, height))
         K = torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
         camera = Camera(torch.eye(4), K, width, height).to(backend.device)
-        place = {"device": backend.device}
-        geometry = (
-            torch.tensor([[0.0, 0.0, 2.0]], **place),
-            torch.tensor([[1.0, 0.0, 0.0, 0.0]], **place),
-            torch.full((1, 2), 2.0, **place),
-            torch.full((1,), 2.0, **place),
-            torch.zeros(1, **place),
-        )
+        disc = ([[0.0, 0.0, 2.0]], [[1.0, 0.0, 0.0, 0.0]], [[2.0, 2.0]], [2.0], [0.0])
+        geometry = (torch.tensor(value, device=backend.device) for value in disc)
         fragments = ops.trace(ops.project(*geometry, camera))
         assert sorted(fragments.pixel.tolist()) == list(range(width * height))

@@ -125,16 +125,9 @@ def test_texels_keep_the_picture_of_a_scene_with_a_large_extent(
                     before = evaluate(scene, here, config).psnr
                 trainer.advance()
         losses[name] = (before, evaluate(scene, here, config).psnr, trainer.training.guard.rollbacks)
+    step_sizes = trainer.training.step_sizes  # of rates in extents
+    assert step_sizes.factors() == {} and step_sizes.rate("means", 9) == trainer.training.schedule.lr("means", 9)
     before, after, rollbacks = losses["pixels"]
     assert after > before and rollbacks == 0
     if by > 1:
         assert losses["extent"][1] < after - 1.0
-
-
-def test_rates_in_shares_of_the_extent_are_those_of_the_polish(make_scene, views: list[View]) -> None:
-    rates = LearningRates(means=(1.6e-4, 1.6e-6))
-    trainer = Trainer(make_scene(), views, TrainConfig(lr=rates), 100)
-    trainer.advance()
-    extent = trainer.training.schedule.extent
-    assert trainer.optimizers["means"].param_groups[0]["lr"] == pytest.approx(4 * 1.6e-4 * extent)
-    assert trainer.training.step_sizes.factors() == {} and len(trainer.training.step_sizes.footprints) == 0

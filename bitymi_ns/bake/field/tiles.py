@@ -52,10 +52,10 @@ def field_tiles(
     """Drop surfels of a bake without tiles (`prune.drop_unseen`), and make tiles with the values of a field at the
     texel centres.
 
-    With a tolerance a tile covers the disc in which fragments reach the weight bound. Beyond it the field is read at
-    the nearest point of the disc: values stay smooth and in the range of what is seen. `cameras`: of the training
-    views. `pixels_per_texel`: least number of pixels of the surfel per texel, in the view that shows most of it; None =
-    as many texels as field and views resolve. Raises ValueError: no surfel is left, or the atlas would be too large."""
+    With a tolerance a tile covers the disc in which fragments reach the weight bound; beyond it the field is read at
+    the nearest point of the disc. `cameras`: of the training views. `pixels_per_texel`: least number of pixels of the
+    surfel per texel, in the view that shows most of it; None = as many texels as field and views resolve. Raises
+    ValueError: no surfel is left, or the atlas would be too large."""
     options = baked.options
     means, scales = (baked.scene.surfels[name].to(baked.device) for name in ("means", "log_scales"))
     finest = torch.stack([field.voxel_size(part).amin() for part in means.split(options.chunk)]).amin()

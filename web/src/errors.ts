@@ -16,12 +16,13 @@ export class NoGraphics extends ViewerError {}
 export const tooLarge = (detail: string): ViewerError =>
   new ViewerError('This scene is too large for this device', detail, 'Open it on a device with more memory.');
 
+export const messageOf = (error: unknown): string => (error instanceof Error ? error.message : String(error));
+
 // Explains any error; a RangeError of a too large array is a lack of memory.
 export function reasonOf(error: unknown): ViewerError {
   if (error instanceof ViewerError) return error;
   if (error instanceof RangeError) return tooLarge('There is not enough memory for it.');
-  const message = error instanceof Error ? error.message : String(error);
-  return new ViewerError('The viewer stopped', message, 'Reload the page to try again.');
+  return new ViewerError('The viewer stopped', messageOf(error), 'Reload the page to try again.');
 }
 
 const COPY = 'Copy the bundle again from where it is whole, or export the scene again with ns-export bitymi-atlas.';

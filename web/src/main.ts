@@ -6,7 +6,7 @@ import { type Bundle, loadBundle, loadManifest } from './bundle/load';
 import { loadPoster, loadPreview } from './bundle/poster';
 import { BESIDE, Folder, SingleFile, type Source } from './bundle/source';
 import { Embed } from './embed';
-import { NoGraphics, ViewerError } from './errors';
+import { NoGraphics, ViewerError, messageOf } from './errors';
 import { type Graphics, openDevice, watch } from './render/device';
 import { checkRoom } from './render/limits';
 import { Programs } from './render/programs';
@@ -48,7 +48,7 @@ async function notesOf(from: Source, stated: boolean): Promise<Notes> {
     const text = await from.notes(stated);
     if (text !== null) return parseNotes(text);
   } catch (error) {
-    notify(`notes.json cannot be used: ${error instanceof Error ? error.message : String(error)}`);
+    notify(`notes.json cannot be used: ${messageOf(error)}`);
   }
   return noNotes();
 }

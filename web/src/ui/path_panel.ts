@@ -1,4 +1,5 @@
 // Panel of the camera path: list of keyframes, playback, saving.
+import { messageOf } from '../errors';
 import { CameraPath, LONGEST, SECONDS, SHORTEST, within } from '../view/path';
 import type { Pose, View } from '../view/pose';
 import { button, download, element, make, onClick, press, toggle } from './dom';
@@ -149,7 +150,7 @@ export class PathPanel {
       if (file.size > MOST_BYTES) throw new Error(`it has ${file.size} bytes, at most ${MOST_BYTES} are read.`);
       this.path.load(await file.text());
     } catch (error) {
-      notify(`${file.name} is no camera path: ${error instanceof Error ? error.message : String(error)}`);
+      notify(`${file.name} is no camera path: ${messageOf(error)}`);
     }
     element<HTMLInputElement>('path-file').value = ''; // so that the same file can be chosen again
     for (const what of ['smooth', 'loop'] as const) press(element(what), this.path[what]);

@@ -1,5 +1,5 @@
 // Columns of entropy-coded integers: docs/baking.md, "Columns of integers"; csrc/cpu/entropy.cpp writes them.
-import { DamagedBundle } from '../../errors';
+import { DamagedBundle, messageOf } from '../../errors';
 
 const PRECISION = 12; // log2 of the sum of a table's frequencies
 const TOTAL = 1 << PRECISION;
@@ -211,7 +211,7 @@ export class ColumnReader {
     try {
       decodeIntegers(this.data.subarray(this.at, this.at + size), codes, blocks, sums, number);
     } catch (error) {
-      throw new DamagedBundle(`${this.file}: a column is damaged: ${error instanceof Error ? error.message : error}.`);
+      throw new DamagedBundle(`${this.file}: a column is damaged: ${messageOf(error)}.`);
     }
     this.at += size;
     return codes;

@@ -11,7 +11,7 @@ const BLOCK = 8;
 const FILE = 'texels.bin';
 
 function tilesOf(surfels: Surfels) {
-  const numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
+  const numbers = numbersOf(surfels);
   const tiles = [];
   for (let surfel = 0; surfel < surfels.count; surfel++) {
     const sides = numbers[surfel * SURFEL_WORDS + WORD.sides];
@@ -20,6 +20,8 @@ function tilesOf(surfels: Surfels) {
   return tiles;
 }
 type Tile = ReturnType<typeof tilesOf>[number];
+
+const numbersOf = ({ words }: Surfels): Uint32Array => new Uint32Array(words.buffer, words.byteOffset, words.length);
 
 // Returns C(k, i, count) for all frequencies k and positions i.
 const cosines = (count: number): Float64Array =>
@@ -101,7 +103,7 @@ class Painter {
     this.perByte = 255 / atlas.scale;
     const empty = this.code(0, 0, 0) & (atlas.alphaScale ? 0xffffff : -1);
     this.pages = new Uint32Array(width * height * layers).fill(empty);
-    this.numbers = new Uint32Array(surfels.words.buffer, surfels.words.byteOffset, surfels.words.length);
+    this.numbers = numbersOf(surfels);
   }
 
   private byte(residual: number): number {

@@ -47,8 +47,7 @@ template <class T> struct Interval {
   }
 };
 
-// Image of a level set: the ellipse's box and outermost points, and the low pass's disc; pixels from the projected
-// centre.
+// Image of a level set, pixels from the projected centre: the ellipse's box and outermost points, the low pass's disc.
 template <class T> struct Outline {
   MaskOf<T> whole = T(0.0f) < T(0.0f);             // the disc comes near the camera plane: covers the screen
   MaskOf<T> ellipse = T(0.0f) < T(0.0f);           // false: low pass only
@@ -83,8 +82,7 @@ template <class T> BT_HD DiscImage<T> disc_image(const T* g, T r2) {
 
 // Returns true where the part of a disc in front of the camera lies beyond a border of the image. `border`: offset of
 // the border's line from the projected centre, between the centre and the image; 0: the centre is not beyond it. If
-// X.q < border (1 + C.q) on the whole disc, or >, no ray of the image meets it, even where it has no box. False for
-// NaN.
+// X.q < border (1 + C.q) on the whole disc, or >, no ray of the image meets it, even without a box. False for NaN.
 template <class T> BT_HD MaskOf<T> beyond_border(T xu, T xv, T cu, T cv, T border) {
   const T u = xu - border * cu, v = xv - border * cv, far = abs_(border);
   const T room = far - T(1e-5) * (abs_(xu) + abs_(xv) + far * (abs_(cu) + abs_(cv)));  // less the rounding error

@@ -52,8 +52,7 @@ BT_HD uint32_t to_index(float x) { return uint32_t(int32_t(x)); }
 BT_HD uint32_t to_index(double x) { return uint32_t(int32_t(x)); }
 
 // Maps a world position to grid coordinates in [0, 1]^3. With contraction p -> (2 - 1/|p|) p/|p| outside the unit ball
-// (mip-NeRF 360, Barron et al. 2022) the ball of radius 2 fills the cube; without it the cube of half edge `half` does,
-// clamped.
+// (mip-NeRF 360, Barron et al. 2022) the ball of radius 2 fills the cube; without it the cube of half edge `half` does.
 template <class S, class T> BT_HD Vec3<T> grid_coordinate(Vec3<T> x, Vec3<S> mid, S half, bool contract) {
   const T k = T(S(1) / half), one = T(S(1)), zero = T(S(0));
   const Vec3<T> p = {k * (x.x - T(mid.x)), k * (x.y - T(mid.y)), k * (x.z - T(mid.z))};
@@ -80,8 +79,7 @@ template <class S> BT_HD Vec3<S> grid_coordinate_vjp(Vec3<S> x, Vec3<S> mid, S h
   return k * (tangential * (dc - along * n) + (radial * along) * n);
 }
 
-// Corners of a level's cell: entries of the hash table, XOR of coordinate times prime, and trilinear weights. Bits of
-// the corner's index: x, y, z.
+// Corners of a level's cell: entries of the hash table and trilinear weights. Bits of the corner's index: x, y, z.
 template <class T> struct Corners {
   typename IndexOf<T>::type index[8];
   T weight[8];

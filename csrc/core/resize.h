@@ -25,8 +25,7 @@ template <class S> struct Resize {
         share(photo_pixel * photo_pixel * sharp) {}
 };
 
-// Resizes a row of geom; kLowPassHeight becomes the height of the low pass over that of the kernel at the centre. False
-// where the row is no longer finite.
+// Resizes a row of geom; kLowPassHeight becomes the low pass's height over the kernel's. False if no longer finite.
 template <class S, class T> BT_HD MaskOf<T> resize(const Resize<S>& to, T* g) {
   const T zero = T(0.0f), one = T(1.0f), two = T(2.0f);
   g[kLowPassHeight] = T(to.share);

@@ -30,8 +30,7 @@ BT_HD ViewColorWidths view_color_widths(int kind, int K) {
   return for_view_color(kind, [=](auto view_color) { return view_color.widths(K); });
 }
 
-// Parameters of n surfels: a, b and c are [n, width] (view_color_widths). `terms`: number of sites, coefficients (with
-// dc) or lobes.
+// Parameters of n surfels: a, b and c are [n, width] (view_color_widths). `terms`: sites, coefficients or lobes.
 template <class S> struct ViewColorArrays {
   int kind, terms;
   S *a, *b, *c;

@@ -107,16 +107,14 @@ struct SphericalVoronoi {
   }
 };
 
-// Reduced form of a kind with unchanged terms. kInBase: number of terms in the base, 1 for spherical harmonics (degree
-// 0).
+// Reduced form of a kind with unchanged terms. kInBase: terms in the base, 1 for spherical harmonics (degree 0).
 template <class Kind, int kInBase = 0> struct StoredWhole {
   template <class S> BT_HD static Vec3<S> reduced_color(int K, const S* base, const S* terms, Vec3<S> d) {
     return Kind::color(K + kInBase, ViewColorRow<const S>{base, terms, nullptr}, d);
   }
 };
 
-// Computes real spherical harmonics up to degree 3 in the order and sign convention of 3DGS: the first `terms` of out
-// [16].
+// Computes real spherical harmonics up to degree 3 in the order and signs of 3DGS: the first `terms` of out [16].
 template <class S> BT_HD void sh_basis(int terms, Vec3<S> d, S* out) {
   const S x = d.x, y = d.y, z = d.z, xx = x * x, yy = y * y, zz = z * z;
   out[0] = S(kShC0);

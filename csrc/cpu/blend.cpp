@@ -308,8 +308,7 @@ template <class S> void move_texels(const S* rows, int64_t count, S rate, const 
   }
   for (; t < count; ++t) store3(texels + 3 * t, texel_step(load3(texels + 3 * t), load3(rows + 4 * t), rate, share[t]));
 }
-// Surfel by surfel: each thread adds to its own surfels' texels. Also without learning texels, for equal gradients of
-// surfels.
+// Surfel by surfel: each thread adds to its own surfels' texels; also without, for equal gradients of surfels.
 template <bool kMaps, class S>
 void backward_by_surfel(const Backward<S>& a, const BlockPicture<S, kChannels<kMaps>>& dimage, const ListedRuns& listed,
                         const std::vector<int64_t>& order) {

@@ -42,8 +42,7 @@ template <class S> class Binner {
  public:
   using Aside = std::function<void(int64_t begin, int64_t end)>;
   virtual ~Binner() = default;
-  // Called by all threads; the lists are complete when it returns. aside(begin, end): work for all surfels that the
-  // threads do while one of them sorts.
+  // Called by all threads; then the lists are complete. aside(begin, end): work for all surfels while a thread sorts.
   virtual void run(const Member& m, const Aside& aside) = 0;
 };
 template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& bins);
@@ -170,8 +169,7 @@ struct ListedIds {
 };
 void list_ids(const ListedIds& a);
 
-// Selects the fragments with keep [F] not 0. Writes their arrays, tile_start, block_start, and as many rows of blocks
-// as the last block_start.
+// Selects the fragments with keep [F] not 0; writes their arrays, the starts, and block_start[tiles] blocks.
 template <class S> struct SelectBlocks {
   TileBlocks layout;
   const uint8_t* keep;

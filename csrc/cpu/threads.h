@@ -66,8 +66,7 @@ template <class F> void parallel_each(int64_t n, int64_t least, F&& fn) {
   });
 }
 
-// Splits items of cumulative cost `start` into `parts` of about equal cost, by the input alone: sums over the parts do
-// not depend on scheduling.
+// Splits items of cumulative cost `start` into `parts` of about equal cost, by the input alone.
 inline std::vector<int64_t> balanced_parts(const int64_t* start, int64_t items, int parts) {
   std::vector<int64_t> cut(parts + 1, items);
   cut[0] = 0;

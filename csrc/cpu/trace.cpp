@@ -135,8 +135,7 @@ template <class S> void trace_backward(const TraceBackward<S, TileBlocks>& a) {
   std::fill(absgrad, absgrad + 2 * n, S(0));
   const BlockCentres<S> centres;
   const P zero = P(S(0));
-  // Arrays and their prefetch distances: runs are read from the list's end, each from its start, which hardware does
-  // not predict.
+  // Arrays and their prefetch distances: hardware does not predict runs, read from the list's end, each from its start.
   const S* columns[] = {f.sigma,
                         f.weight,
                         dweight,

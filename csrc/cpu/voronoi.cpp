@@ -149,8 +149,7 @@ template <class S> class SiteLanes {
       }
     }
   }
-  // Solves the damped system by its Schur complement: the colours are eliminated first, as their block is the same for
-  // each channel.
+  // Solves the damped system by its Schur complement: first the colours, whose block is the same per channel.
   void step(const P& damping) {
     P mean(S(0));
     for (int i = 0; i < linear_; ++i) mean += vv_[pair(i, i)];

@@ -27,8 +27,7 @@ template <class S, class Layout> struct BlendedSurfels {
 };
 
 // Writes image [height, width, channels]: the sums of core/blend.h, kMapChannels with maps, else kImageChannels, of the
-// colours relu(relu(base + 0.5) + residual). The residual of texels is texel(u, v), and 0 below `bound` or without a
-// tile.
+// colours relu(relu(base + 0.5) + residual). The residual of texels is 0 below `bound` or without a tile.
 template <class S, class Layout> struct BlendForward {
   BlendedSurfels<S, Layout> of;
   S* image;

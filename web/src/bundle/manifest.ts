@@ -24,37 +24,37 @@ class Reader {
     return this.value[key] !== undefined && this.value[key] !== null;
   }
   part(key: string): Reader {
-    const found = this.value[key];
-    if (typeof found !== 'object' || found === null || Array.isArray(found)) this.refuse(key, 'an object');
-    return new Reader(found as Json, `${this.path}${key}.`, key);
+    const entry = this.value[key];
+    if (typeof entry !== 'object' || entry === null || Array.isArray(entry)) this.refuse(key, 'an object');
+    return new Reader(entry as Json, `${this.path}${key}.`, key);
   }
   number(key: string): number {
-    const [found, [low, high]] = [this.value[key], RANGES[`${this.name}.${key}`]];
-    if (typeof found !== 'number' || !(found >= low && found <= high)) {
+    const [entry, [low, high]] = [this.value[key], RANGES[`${this.name}.${key}`]];
+    if (typeof entry !== 'number' || !(entry >= low && entry <= high)) {
       this.refuse(key, `a number from ${low} to ${high}`);
     }
-    return found;
+    return entry;
   }
   whole(key: string): number {
-    const found = this.number(key);
-    if (!Number.isInteger(found)) this.refuse(key, 'a whole number');
-    return found;
+    const entry = this.number(key);
+    if (!Number.isInteger(entry)) this.refuse(key, 'a whole number');
+    return entry;
   }
   choice<T extends string>(key: string, choices: readonly T[]): T {
-    const found = this.value[key];
-    if (!choices.includes(found as T)) this.refuse(key, `one of ${choices.join(', ')}`);
-    return found as T;
+    const entry = this.value[key];
+    if (!choices.includes(entry as T)) this.refuse(key, `one of ${choices.join(', ')}`);
+    return entry as T;
   }
   point(key: string): Vec3 {
-    const [found, [low, high]] = [this.value[key], RANGES[`${this.name}.${key}`]];
+    const [entry, [low, high]] = [this.value[key], RANGES[`${this.name}.${key}`]];
     const good = (x: unknown): boolean => typeof x === 'number' && x >= low && x <= high;
-    if (!Array.isArray(found) || found.length !== 3 || !found.every(good)) this.refuse(key, 'three numbers');
-    return found as Vec3;
+    if (!Array.isArray(entry) || entry.length !== 3 || !entry.every(good)) this.refuse(key, 'three numbers');
+    return entry as Vec3;
   }
   list(key: string, most: number): unknown[] {
-    const found = this.value[key];
-    if (!Array.isArray(found) || found.length > most) this.refuse(key, `a list of at most ${most}`);
-    return found as unknown[];
+    const entry = this.value[key];
+    if (!Array.isArray(entry) || entry.length > most) this.refuse(key, `a list of at most ${most}`);
+    return entry as unknown[];
   }
   parts(key: string, most: number): Reader[] {
     return this.list(key, most).map((part, k) => {
@@ -63,10 +63,10 @@ class Reader {
     });
   }
   wholes(key: string, most: number): number[] {
-    const [found, [low, high]] = [this.list(key, most), RANGES[`${this.name}.${key}`]];
+    const [entry, [low, high]] = [this.list(key, most), RANGES[`${this.name}.${key}`]];
     const good = (x: unknown): boolean => Number.isInteger(x) && (x as number) >= low && (x as number) <= high;
-    if (!found.every(good)) this.refuse(key, `whole numbers from ${low} to ${high}`);
-    return found as number[];
+    if (!entry.every(good)) this.refuse(key, `whole numbers from ${low} to ${high}`);
+    return entry as number[];
   }
   entries(most: number): [string, Reader][] {
     const keys = Object.keys(this.value);
@@ -74,9 +74,9 @@ class Reader {
     return keys.map((key) => [key, new Reader(this.part(key).value, `${this.path}${key}.`, this.name)]);
   }
   text(key: string, pattern: RegExp): string {
-    const found = this.value[key];
-    if (typeof found !== 'string' || !pattern.test(found)) this.refuse(key, `a text like ${pattern.source}`);
-    return found;
+    const entry = this.value[key];
+    if (typeof entry !== 'string' || !pattern.test(entry)) this.refuse(key, `a text like ${pattern.source}`);
+    return entry;
   }
 }
 
@@ -145,9 +145,9 @@ function points(r: Reader): Float32Array {
   }
   if (bytes.length % 16 || bytes.length > 16 * MOST_POINTS) refuse();
   const view = new DataView(bytes.buffer);
-  const found = Float32Array.from({ length: bytes.length / 4 }, (_, i) => view.getFloat32(4 * i, true));
+  const rows = Float32Array.from({ length: bytes.length / 4 }, (_, i) => view.getFloat32(4 * i, true));
   const good = (x: number, i: number): boolean => (i % 4 < 3 ? Math.abs(x) <= 1e9 : x >= RATES[0] && x <= RATES[1]);
-  return found.every(good) ? found : refuse();
+  return rows.every(good) ? rows : refuse();
 }
 
 export function parseManifest(text: string) {

@@ -61,13 +61,13 @@ export class Table {
   }
   // Copies a column to `to`, from `first` on with stride `step`.
   into(column: string, to: Float32Array | Uint32Array | Int32Array, first: number, step: number): void {
-    const found = this.element.columns.get(column);
+    const stored = this.element.columns.get(column);
     const type = to instanceof Float32Array ? 'float' : 'int';
-    if (!found || found.type !== type) {
+    if (!stored || stored.type !== type) {
       throw new DamagedBundle(`surfels.ply: ${this.name} has no property ${column} of type ${type}.`);
     }
     const stride = this.element.stride;
-    for (let i = 0, at = found.at, k = first; i < this.count; i++, at += stride, k += step) {
+    for (let i = 0, at = stored.at, k = first; i < this.count; i++, at += stride, k += step) {
       to[k] = type === 'float' ? this.view.getFloat32(at, true) : this.view.getInt32(at, true);
     }
   }

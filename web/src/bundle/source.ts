@@ -112,11 +112,11 @@ export class SingleFile implements Source {
   }
 
   private entry(name: string): Entry {
-    const found = this.entries.get(name);
-    if (!found) throw new DamagedBundle(`The bundle has no ${name}.`);
-    if (!found.stored) throw new DamagedBundle(`${name} is not stored as it is.`);
-    if (found.begin >= found.end) throw new DamagedBundle(`${name} lies beyond the end of the file.`);
-    return found;
+    const part = this.entries.get(name);
+    if (!part) throw new DamagedBundle(`The bundle has no ${name}.`);
+    if (!part.stored) throw new DamagedBundle(`${name} is not stored as it is.`);
+    if (part.begin >= part.end) throw new DamagedBundle(`${name} lies beyond the end of the file.`);
+    return part;
   }
 
   async read(name: string, size: number, came: Came): Promise<ArrayBuffer> {

@@ -11,10 +11,10 @@ const SAME = 1e-6; // difference of equal poses, relative
 
 const isNumber = (x: unknown): x is number => typeof x === 'number' && Number.isFinite(x);
 
-function correctionOf(found: unknown): number[] | null {
-  if (!Array.isArray(found) || !found.every(isNumber)) return null;
-  if (found.length === 3) return found.flatMap((gain, c) => [0, 1, 2, 3].map((k) => (k === c ? gain : 0)));
-  return found.length === 12 ? found : null;
+function correctionOf(stored: unknown): number[] | null {
+  if (!Array.isArray(stored) || !stored.every(isNumber)) return null;
+  if (stored.length === 3) return stored.flatMap((gain, c) => [0, 1, 2, 3].map((k) => (k === c ? gain : 0)));
+  return stored.length === 12 ? stored : null;
 }
 
 function camera(row: unknown) {

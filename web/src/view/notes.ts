@@ -86,9 +86,9 @@ function numbersOf(value: unknown, where: string, count = 3): number[] {
 const pointOf = (value: unknown, where: string): Vec3 => numbersOf(value, where) as Vec3;
 
 function unitVector(value: unknown, where: string, count: number): number[] {
-  const found = numbersOf(value, where, count);
-  if (!(Math.abs(Math.hypot(...found) - 1) <= UNIT_LENGTH)) refuse(where, 'must have the length 1');
-  return found;
+  const vector = numbersOf(value, where, count);
+  if (!(Math.abs(Math.hypot(...vector) - 1) <= UNIT_LENGTH)) refuse(where, 'must have the length 1');
+  return vector;
 }
 
 function boxOf(value: unknown, where: string): Box {
@@ -101,14 +101,14 @@ function boxOf(value: unknown, where: string): Box {
 
 function cropOf(value: unknown): Cropping['crop'] {
   const { box, floor } = keysOf(value, 'crop', [], ['box', 'floor']);
-  const found: Cropping['crop'] = {};
-  if (box !== undefined) found.box = boxOf(box, 'crop.box');
+  const cropped: Cropping['crop'] = {};
+  if (box !== undefined) cropped.box = boxOf(box, 'crop.box');
   if (floor !== undefined) {
     const { normal, offset } = keysOf(floor, 'crop.floor', ['normal', 'offset']);
     const direction = unitVector(normal, 'crop.floor.normal', 3) as Vec3;
-    found.floor = { normal: direction, offset: numberOf(offset, 'crop.floor.offset') };
+    cropped.floor = { normal: direction, offset: numberOf(offset, 'crop.floor.offset') };
   }
-  return found;
+  return cropped;
 }
 
 function unitOf(value: unknown): Unit {
@@ -139,16 +139,16 @@ export function parseNotes(text: string): Notes {
   if (root.format !== FORMAT) refuse('format', `must be ${FORMAT}`);
   if (version !== 1 && version !== 2) refuse('version', `must be 1 or ${NEWEST}`);
   const names = new Set<string>();
-  const views = rows(root.views, 'views', MOST_VIEWS).map((each, k) => {
+  const views = rows(root.views, 'views', MOST_VIEWS).map((view, k) => {
     const where = `views.${k}`;
-    const { name, ...camera } = keysOf(each, where, ['name', 'position', 'right', 'forward', 'target', 'lens']);
-    const found = textOf(name, `${where}.name`, LONGEST_NAME);
-    if (names.has(found)) refuse(`${where}.name`, 'is there twice');
-    names.add(found);
-    return { name: found, viewpoint: viewpointOf(camera) ?? refuse(where, 'must be a camera') };
+    const { name, ...camera } = keysOf(view, where, ['name', 'position', 'right', 'forward', 'target', 'lens']);
+    const title = textOf(name, `${where}.name`, LONGEST_NAME);
+    if (names.has(title)) refuse(`${where}.name`, 'is there twice');
+    names.add(title);
+    return { name: title, viewpoint: viewpointOf(camera) ?? refuse(where, 'must be a camera') };
   });
-  const notes = rows(root.notes, 'notes', MOST_NOTES).map((each, k) => {
-    const { text: words, position } = keysOf(each, `notes.${k}`, ['text', 'position']);
+  const notes = rows(root.notes, 'notes', MOST_NOTES).map((note, k) => {
+    const { text: words, position } = keysOf(note, `notes.${k}`, ['text', 'position']);
     const at = pointOf(position, `notes.${k}.position`);
     return { text: textOf(words, `notes.${k}.text`, LONGEST_TEXT), position: at };
   });
@@ -156,10 +156,10 @@ export function parseNotes(text: string): Notes {
   return {
     views,
     notes,
-    measures: rows(measures, 'measures', MOST_MEASURES).map((each, k) => measureOf(each, `measures.${k}`)),
+    measures: rows(measures, 'measures', MOST_MEASURES).map((measure, k) => measureOf(measure, `measures.${k}`)),
     unit: unit === undefined ? null : unitOf(unit),
     crop: crop === undefined ? {} : cropOf(crop),
-    hidden: rows(hidden, 'hidden', MOST_HIDDEN).map((each, k) => boxOf(each, `hidden.${k}`)),
+    hidden: rows(hidden, 'hidden', MOST_HIDDEN).map((box, k) => boxOf(box, `hidden.${k}`)),
   };
 }
 

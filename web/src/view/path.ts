@@ -126,7 +126,7 @@ export class CameraPath {
     if ((file?.camera_type ?? 'perspective') !== 'perspective') throw new Error('its cameras are not perspective.');
     const usual = secondsOf(file?.default_transition_sec) ?? SECONDS;
     const read = rows.map((row, k) => keyframeOf((row ?? {}) as Record<string, unknown>, k, usual));
-    this.keyframes = read.map((each, k) => ({ ...each, seconds: read[(k + 1) % read.length].seconds }));
+    this.keyframes = read.map((keyframe, k) => ({ ...keyframe, seconds: read[(k + 1) % read.length].seconds }));
     this.smooth = file?.smoothness_value !== 1;
     this.loop = file?.is_cycle === true;
   }
@@ -167,9 +167,9 @@ function keyframeOf(row: Record<string, unknown>, k: number, usual: number): Key
     const f = height / 2 / Math.tan((Math.PI / 360) * Number(fov));
     lens = [f, f, width / 2, height / 2, width, height];
   }
-  const found = viewpointOf({ position, right, forward: times(-1, back), target: position, lens });
-  if (!found || !(dot(found.pose.down, up) < -0.9)) throw new Error(`keyframe ${k + 1} is no camera.`);
-  return { ...found, seconds: (own === true ? secondsOf(seconds) : null) ?? usual };
+  const viewpoint = viewpointOf({ position, right, forward: times(-1, back), target: position, lens });
+  if (!viewpoint || !(dot(viewpoint.pose.down, up) < -0.9)) throw new Error(`keyframe ${k + 1} is no camera.`);
+  return { ...viewpoint, seconds: (own === true ? secondsOf(seconds) : null) ?? usual };
 }
 
 // Converts to a row-major matrix; x right, y up, z backward.

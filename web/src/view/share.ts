@@ -19,8 +19,8 @@ export interface Shared extends Viewpoint {
 export const lensOf = (l: Lens): number[] => [l.fx, l.fy, l.cx, l.cy, l.width, l.height];
 const round = (x: number): string => String(Number(x.toPrecision(9)));
 const numbers = (text: string | null, count: number): number[] | null => {
-  const found = (text ?? '').split(',').map(Number);
-  return text !== null && found.length === count && found.every(Number.isFinite) ? found : null;
+  const list = (text ?? '').split(',').map(Number);
+  return text !== null && list.length === count && list.every(Number.isFinite) ? list : null;
 };
 
 export function toHash({ pose, lens, target, show, residuals }: Shared): string {
@@ -68,8 +68,8 @@ export function fromHash(hash: string): Shared | null {
   const [position, axes] = [numbers(given.get('p'), 3), numbers(given.get('r'), 6)];
   const [right, forward] = [axes?.slice(0, 3), axes?.slice(3)];
   const [target, lens] = [numbers(given.get('t'), 3), numbers(given.get('l'), 6)];
-  const found = viewpointOf({ position, right, forward, target, lens });
+  const viewpoint = viewpointOf({ position, right, forward, target, lens });
   const asked = given.get('show') ?? 'color';
   const show = asked in SHOW ? (asked as Show) : 'color';
-  return found && { ...found, show, residuals: given.get('texture') !== 'off' };
+  return viewpoint && { ...viewpoint, show, residuals: given.get('texture') !== 'off' };
 }

@@ -44,8 +44,8 @@ type Transform = ReturnType<typeof transformOf>;
 const half = new Float64Array(BLOCK * BLOCK); // scratch of `inverse`: a block transformed along u
 
 // Computes a channel of a block's texels from every `stride`-th number from `first` on. Sides are multiples of four.
-function inverse(values: Int32Array, first: number, stride: number, of: Transform, texels: Float64Array): void {
-  const { u, v, across, down, row, wave } = of;
+function inverse(values: Int32Array, first: number, stride: number, transform: Transform, texels: Float64Array): void {
+  const { u, v, across, down, row, wave } = transform;
   const count = u * v;
   half.fill(0);
   for (let f = 0, from = first; f < count; f++, from += stride) {
@@ -135,21 +135,21 @@ class Painter {
   }
 
   // Writes the residual colours of blocks from coefficients [channel][frequency * blocks + block].
-  colors(of: Blocks, coefficients: Int32Array[], steps: Float64Array): void {
-    const { u, v } = of;
-    const [transform, offsets] = [transformOf(u, v), this.offsets(of)];
+  colors(blocks: Blocks, coefficients: Int32Array[], steps: Float64Array): void {
+    const { u, v } = blocks;
+    const [transform, offsets] = [transformOf(u, v), this.offsets(blocks)];
     const [p0, p1, p2] = this.sums;
     const [c0, c1, c2] = coefficients;
-    const [blocks, words] = [of.texels / (u * v), this.surfels.words];
+    const [count, words] = [blocks.texels / (u * v), this.surfels.words];
     const [toGrey, toTilt, toBend] = [3, 2, 6].map((squares) => 1 / Math.sqrt(squares));
-    this.each(of, (tile, row, block, first) => {
+    this.each(blocks, (tile, row, block, first) => {
       const red = words[row + WORD.residual];
       const green = words[row + WORD.residual + 1];
       const blue = words[row + WORD.residual + 2];
       const step = steps[tile];
-      inverse(c0, block, blocks, transform, p0);
-      inverse(c1, block, blocks, transform, p1);
-      inverse(c2, block, blocks, transform, p2);
+      inverse(c0, block, count, transform, p0);
+      inverse(c1, block, count, transform, p1);
+      inverse(c2, block, count, transform, p2);
       for (let t = 0; t < offsets.length; t++) {
         const grey = step * toGrey * p0[t];
         const tilt = step * toTilt * p1[t];
@@ -164,14 +164,14 @@ class Painter {
   }
 
   // Writes the alphas of blocks, after their colours.
-  alphas(of: Blocks, [coefficients]: Int32Array[], steps: Float64Array): void {
-    const { u, v } = of;
-    const [transform, offsets] = [transformOf(u, v), this.offsets(of)];
+  alphas(blocks: Blocks, [coefficients]: Int32Array[], steps: Float64Array): void {
+    const { u, v } = blocks;
+    const [transform, offsets] = [transformOf(u, v), this.offsets(blocks)];
     const [sums] = this.sums;
     const perByte = 255 / this.atlas.alphaScale;
-    this.each(of, (tile, row, block, first) => {
+    this.each(blocks, (tile, row, block, first) => {
       const mean = alphaIn(this.numbers[row + WORD.layer]);
-      inverse(coefficients, block, of.texels / (u * v), transform, sums);
+      inverse(coefficients, block, blocks.texels / (u * v), transform, sums);
       for (let t = 0; t < u * v; t++) {
         const to = first + offsets[t];
         const byte = byteOf((mean + steps[tile] * sums[t]) * perByte);
@@ -214,9 +214,9 @@ export function readCompactTexels(data: Uint8Array, atlas: Atlas, surfels: Surfe
   const held = new Map<string, Blocks>();
   for (const tile of tiles) {
     const [u, v] = [Math.min(tile.u, BLOCK), Math.min(tile.v, BLOCK)];
-    const of = held.get(`${u}x${v}`) ?? { u, v, texels: 0 };
-    of.texels += tile.u * tile.v;
-    held.set(`${u}x${v}`, of);
+    const blocks = held.get(`${u}x${v}`) ?? { u, v, texels: 0 };
+    blocks.texels += tile.u * tile.v;
+    held.set(`${u}x${v}`, blocks);
   }
   check(
     data,
@@ -238,13 +238,17 @@ export function readCompactTexels(data: Uint8Array, atlas: Atlas, surfels: Surfe
   for (const { name, step } of coded.columns.slice(1)) {
     const isAlpha = name.startsWith('alpha_');
     if (isAlpha && step === null) throw new DamagedBundle(`${FILE}: ${name} has no step.`);
-    const of = held.get(name.replace('alpha_', ''))!;
-    const coefficients = reader.read(of.texels, (rows) => new Int32Array(rows), of.texels / (of.u * of.v));
+    const blocks = held.get(name.replace('alpha_', ''))!;
+    const coefficients = reader.read(
+      blocks.texels,
+      (rows) => new Int32Array(rows),
+      blocks.texels / (blocks.u * blocks.v),
+    );
     if (coefficients.some(tooLarge)) {
       throw new DamagedBundle(`${FILE}: a coefficient of ${name} is beyond ${MOST_COEFFICIENT}.`);
     }
-    if (isAlpha) painter.alphas(of, coefficients, stepsOf(step!));
-    else painter.colors(of, coefficients, stepsOf(coded.step));
+    if (isAlpha) painter.alphas(blocks, coefficients, stepsOf(step!));
+    else painter.colors(blocks, coefficients, stepsOf(coded.step));
   }
   return { format: 'uint8', width: atlas.width, height: atlas.height, layers: painter.layers() };
 }

@@ -87,7 +87,8 @@ def test_many_texels_become_blocks_for_a_card_where_they_are_asked_for(tmp_path:
     monkeypatch.setattr(read, "LARGE_ATLAS", whole.atlas.numel())
     many = read_bundle(folder, decode=False).scene
     assert many.atlas is None and many.blocks.numel() == whole.atlas.numel() / 4
-    owned = pixels_of(whole.tiles, whole.atlas)
+    layers, height, width = whole.atlas.shape[:3]
+    owned = covered_blocks(whole.tiles.numpy(), width, height, layers).repeat(4, 1).repeat(4, 2)
     error = (decoded(many.blocks)[owned].float() - whole.atlas[owned].float()).square().mean(0).sqrt()
     assert 0 < error[:3].max() < 40  # steps of 255, of texels that are noise of a deviation of 37
     assert (0 < error[3] < 40) == alpha
@@ -103,12 +104,6 @@ def test_many_texels_become_blocks_for_a_card_where_they_are_asked_for(tmp_path:
 
 def fails_for_lack_of_memory(*_: object, **options: object) -> None:
     raise RuntimeError("DefaultCPUAllocator: not enough memory")
-
-
-def pixels_of(tiles: torch.Tensor, atlas: torch.Tensor) -> torch.Tensor:
-    layers, height, width = atlas.shape[:3]
-    owned = torch.from_numpy(covered_blocks(tiles.numpy(), width, height, layers))
-    return owned.repeat_interleave(4, 1).repeat_interleave(4, 2)
 
 
 def _column(info: dict, name: str) -> dict:

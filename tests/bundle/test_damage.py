@@ -15,19 +15,38 @@ from tests.bundle.damage import amend
 from tests.bundle.made import make
 
 
-def test_parameters_that_are_not_finite_are_not_written(surfels, tmp_path):
-    params = surfels(3)
-    params["log_scales"][1, 0] = float("nan")
-    with pytest.raises(BundleError, match="log_scales is not finite in row 1"):
-        write(tmp_path / "b", params, np.zeros((3, 5), dtype=np.int32), None)
-    with pytest.raises(BundleError, match="rows"):
-        write(tmp_path / "b", surfels(3), np.zeros((2, 5), dtype=np.int32), None)
-    with pytest.raises(BundleError, match="cannot be the name"):
-        make(surfels, tmp_path / "b", extra_files={"../escape": b""})
-    for name in ("surfels.ply", POSTER):
-        with pytest.raises(BundleError, match=f"may not replace {name}"):
-            make(surfels, tmp_path / "b", extra_files={name: b""})
+@pytest.mark.parametrize(
+    "change, options, reason",
+    [
+        (("log_scales", (1, 0), float("nan")), {}, "log_scales is not finite in row 1"),
+        (("sv_rgb", (3, 1, 2), 1e4), {}, "sv_rgb_5 is 10000 in row 3; it must be from -256 to 256"),
+        (("quats", 2, 0.0), {}, "quats has the length 0 in row 2"),
+        (None, {"tiles": np.zeros((2, 5), dtype=np.int32)}, "rows"),
+        (None, {"background": (255, 0, 0)}, "render.background.0 must be less than or equal to 1"),
+        (None, {"extra_files": {"../escape": b""}}, "cannot be the name"),
+        *((None, {"extra_files": {name: b""}}, f"may not replace {name}") for name in ("surfels.ply", POSTER)),
+    ],
+)
+def test_what_would_be_refused_is_not_written(surfels, tmp_path, change, options, reason):
+    params = surfels(6)
+    if change is not None:
+        name, entry, value = change
+        params[name][entry] = value
+    with pytest.raises(BundleError, match=reason):
+        write(tmp_path / "b", params, **options)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "means, reason",
+    [
+        (None, "the atlas has alphas, the surfels have no mean alphas"),
+        (torch.full((6,), 2.5), "alpha is 2.5 in row 0; it must be from 0 to 2"),
+    ],
+)
+def test_alphas_without_their_means_are_not_written(surfels, tmp_path, means, reason):
+    with pytest.raises(BundleError, match=reason):
+        make(surfels, tmp_path / "b", alpha=True, mean_alpha=means)
 
 
 def failures(folder):

@@ -18,20 +18,12 @@ def make(folder, format, width=8, height=12, layers=3):
 def by_the_specification(data):
     """Parse the fields of a KTX2 file by the specification's tables, sharing no code with the writer."""
 
-    def u32(at):
-        return int.from_bytes(data[at : at + 4], "little")
-
-    def u64(at):
-        return int.from_bytes(data[at : at + 8], "little")
-
     names = "vkFormat typeSize pixelWidth pixelHeight pixelDepth layerCount faceCount levelCount scheme".split()
     names += "dfdByteOffset dfdByteLength kvdByteOffset kvdByteLength".split()
-    f = {name: u32(12 + 4 * i) for i, name in enumerate(names)}
-    f |= {"identifier": data[:12], "sgdByteOffset": u64(64), "sgdByteLength": u64(72)}
-    f |= {"byteOffset": u64(80), "byteLength": u64(88), "uncompressedByteLength": u64(96)}
-    dfd = f["dfdByteOffset"]
-    word = [u32(dfd + 4 + 4 * i) for i in range((f["dfdByteLength"] - 4) // 4)]
-    f |= {"dfdTotalSize": u32(dfd), "vendor": word[0] & 0x1FFFF, "descriptorType": word[0] >> 17}
+    names += "sgdByteOffset sgdByteLength byteOffset byteLength uncompressedByteLength".split()
+    f = dict(zip(names, struct.unpack_from("<13I5Q", data, 12), strict=True)) | {"identifier": data[:12]}
+    total, *word = struct.unpack_from(f"<{f['dfdByteLength'] // 4}I", data, f["dfdByteOffset"])
+    f |= {"dfdTotalSize": total, "vendor": word[0] & 0x1FFFF, "descriptorType": word[0] >> 17}
     f |= {"versionNumber": word[1] & 0xFFFF, "blockSize": word[1] >> 16}
     f |= {"model": word[2] & 255, "primaries": word[2] >> 8 & 255, "transfer": word[2] >> 16 & 255}
     f |= {"flags": word[2] >> 24, "texelBlock": [word[3] >> 8 * i & 255 for i in range(4)]}
@@ -41,7 +33,7 @@ def by_the_specification(data):
         f["samples"].append((*sample, word[i + 1], word[i + 2], word[i + 3]))
     f["keys"], at = [], f["kvdByteOffset"]
     while at < f["kvdByteOffset"] + f["kvdByteLength"]:
-        length = u32(at)
+        (length,) = struct.unpack_from("<I", data, at)
         f["keys"].append(tuple(data[at + 4 : at + 4 + length].split(b"\0", 1)))
         assert not any(data[at + 4 + length : at + 4 + (length + 3) // 4 * 4])
         at += 4 + (length + 3) // 4 * 4

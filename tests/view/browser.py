@@ -8,7 +8,7 @@ import select
 import shutil
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -109,14 +109,20 @@ def served(site: Site, **options: Any) -> AbstractContextManager[str]:
     return running(serve(site, **options))
 
 
+def wait(until: Callable[[], object], tenths: int = 100) -> bool:
+    """Wait until something holds, for some tenths of a second at most; returns whether it does."""
+    for _ in range(tenths):
+        if until():
+            return True
+        time.sleep(0.1)
+    return False
+
+
 def held_back(site: Site, name: str, until: Path) -> Site:
     """Make the site withhold a file until another one exists."""
 
     def late() -> bytes:
-        for _ in range(600):
-            if until.exists():
-                break
-            time.sleep(0.1)
+        wait(until.exists, 600)
         return site.read(name)
 
     return replace(site, files={**site.files, name: late})

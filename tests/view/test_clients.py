@@ -3,7 +3,6 @@
 import http.client
 import socket
 import sys
-import time
 from contextlib import suppress
 from urllib.parse import urlsplit
 
@@ -11,7 +10,7 @@ import pytest
 
 from bitymi_ns.view import serve
 from bitymi_ns.view.page import Site
-from tests.view.browser import running, served
+from tests.view.browser import running, served, wait
 from tests.view.test_serve import ask
 
 
@@ -43,11 +42,7 @@ def test_slow_clients_share_one_copy_of_a_file() -> None:
         assert len(made) == 1
         for client in waiting:
             client.close()
-        for _ in range(100):
-            if not server._held:
-                break
-            time.sleep(0.1)
-        assert not server._held  # freed
+        assert wait(lambda: not server._held)  # freed
         assert ask(address, "/large")[2] == bytes(16 << 20) and len(made) == 2
 
 
@@ -61,12 +56,12 @@ def test_connections_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
             said = clients(address, "/", 1)[0].recv(12)
         assert said in (b"HTTP/1.1 503", b"")
         waiting.pop().close()
-        for _ in range(100):
+
+        def served_again() -> bool:
             with suppress(ConnectionError, http.client.HTTPException):
-                if ask(address, "/")[0] == 200:
-                    break
-            time.sleep(0.1)
-        else:
-            pytest.fail("the place of a client that has gone is not free")
+                return ask(address, "/")[0] == 200
+            return False
+
+        assert wait(served_again)
         for client in waiting:
             client.close()

@@ -13,9 +13,9 @@ from bitymi_ns.bundle import check_files, read_bundle
 from bitymi_ns.bundle.notes import parse_notes
 from bitymi_ns.cli import main
 from tests.view.browser import drive, plain_server
-from tests.view.conftest import HEIGHT, WIDTH, write
+from tests.view.conftest import write
 from tests.view.steps import PHONE, START, Steps
-from tests.view.test_browser import MEAN, difference
+from tests.view.test_browser import MEAN, SCREEN, difference
 from tests.view.test_path import FITS
 
 pytestmark = pytest.mark.slow
@@ -105,7 +105,7 @@ def test_crop_and_measures_survive_pack_and_export(cropped: tuple[Path, str, str
         steps: list[list[object]] = []
         for site in ("one", "site"):
             steps += [["goto", f"{address}{site}/"], ["settle"], ["ask", STATUS], ["ask", LABELS]]
-        found = drive([*steps, ["save", "#screenshot", picture]], (WIDTH, HEIGHT))
+        found = drive([*steps, ["save", "#screenshot", picture]], SCREEN)
     assert not found.problems and found.results[2:4] == found.results[6:8] == [status, labels]
     scene = read_bundle(bundle, crop=True).scene
     assert difference(picture, scene)[0] < MEAN < difference(picture, bundle)[0]

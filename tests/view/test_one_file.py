@@ -10,12 +10,11 @@ from bitymi_ns.bundle.single import write_single
 from bitymi_ns.cli import main
 from bitymi_ns.view import single_site, write_static
 from tests.view.browser import drive, plain_server
-from tests.view.conftest import HEIGHT, WIDTH, write
-from tests.view.test_browser import MEAN, STATE, difference
+from tests.view.conftest import WIDTH, write
+from tests.view.test_browser import MEAN, SCREEN, STATE, difference
 
 pytestmark = pytest.mark.slow
 
-SCREEN = (WIDTH, HEIGHT)
 NAME = "scene.bitymi"
 
 

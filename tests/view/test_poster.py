@@ -15,14 +15,12 @@ from bitymi_ns.view import Site, single_site, site_of, write_static
 from tests.bundle.damage import amend
 from tests.view.browser import Outcome, drive, held_back, pixels, plain_server, served
 from tests.view.conftest import HEIGHT, WIDTH, view, write
-from tests.view.test_browser import MEAN, difference
+from tests.view.steps import START
+from tests.view.test_browser import MEAN, SCREEN, STATE, difference
 
 pytestmark = pytest.mark.slow
 
-SCREEN = (WIDTH, HEIGHT)
 SHOWN = "!document.getElementById('poster').hidden"
-STATE = "document.documentElement.dataset.state"
-LINK = "#p=0,-3,0&r=1,0,0,0,1,0&t=0,0,0&l=500,500,250,250,500,500"
 BARE = (
     "for (const id of ['page', 'top', 'panel', 'menu', 'notice'])"
     "document.getElementById(id).style.visibility = 'hidden'"
@@ -55,12 +53,7 @@ def shots(bundle: Path, folder: Path, size: tuple[int, int], **options: Any) -> 
 
 
 @pytest.mark.parametrize(
-    "size, options",
-    [
-        (SCREEN, {}),
-        ((150, 260), {"touch": True}),
-    ],
-    ids=["like the photograph", "phone"],
+    "size, options", [(SCREEN, {}), ((150, 260), {"touch": True})], ids=["like the photograph", "phone"]
 )
 def test_it_is_there_before_the_surfels_and_where_their_picture_will_be(
     size: tuple[int, int], options: dict[str, Any], tmp_path: Path
@@ -86,7 +79,7 @@ def test_it_is_there_before_the_surfels_and_where_their_picture_will_be(
 def test_a_link_to_another_view_shows_none(tmp_path: Path) -> None:
     bundle, asked = write(tmp_path / "b", "uint8", compact=True, poster=True), list[str]()
     with served(kept(site_of(bundle), asked)) as address:
-        found = drive([["goto", address + LINK], ["settle"], ["ask", SHOWN]], SCREEN, drawn=False)
+        found = drive([["goto", address + START], ["settle"], ["ask", SHOWN]], SCREEN, drawn=False)
     assert not found.problems and found.results[-1] is False
     assert "bundle/texels.bin" in asked and f"bundle/{POSTER}" not in asked
 

@@ -11,15 +11,15 @@ from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.init import tangents
 
 
-def real_scene(surfels):
+def real_scene(surfels, count=80, kind="sv"):
     """Make a scene whose field varies over whole voxels that the tiles resolve."""
     generator = torch.Generator().manual_seed(0)
-    config = SceneConfig(min_resolution=8, log2_table_size=14)
+    config = SceneConfig(view_color=kind, min_resolution=8, log2_table_size=14)
     field = HashField(config, (0.1, 0.2, -0.1), 1.0, True, 14, generator)
     with torch.no_grad():
         field.field_table.normal_(0.0, 0.5, generator=generator)
         field.field_w3.normal_(0.0, 0.2, generator=generator)
-    return Scene(config, surfels(80), field)
+    return Scene(config, surfels(count, kind), field)
 
 
 def test_tiles_at_the_nyquist_rate_hold_the_field(surfels, tmp_path):

@@ -3,10 +3,9 @@
     python -m scripts.fuzz TARGET --seconds 600     a target, or `all` in turn
     python -m scripts.fuzz TARGET --input FILE      reproduce a finding, with its traceback
 
-Needs atheris, which is no dependency of the package: `pip install atheris`, on Linux with Python 3.11 or later.
-
-Any exception other than the reader's documented ones is a finding: the input is saved in --findings, one per line of
-the package that raised, and the exit status is 1. A crash or a hang of compiled code ends the target.
+Needs atheris (`pip install atheris`), on Linux with Python 3.11 or later. Any exception other than the reader's
+documented ones is a finding: the input is saved in --findings, one per line of the package that raised, and the exit
+status is 1. A crash or a hang of compiled code ends the target.
 """
 
 from __future__ import annotations
@@ -56,8 +55,8 @@ def changed_json(data: bytes, dice: random.Random) -> bytes | None:
 
 
 def changed_numbers(data: bytes, dice: random.Random) -> bytes:
-    packed, at = dice.choice(ODD_BYTES), dice.randrange(len(data) + 1)
-    return data[:at] + packed + data[at + len(packed) :]
+    packed, start = dice.choice(ODD_BYTES), dice.randrange(len(data) + 1)
+    return data[:start] + packed + data[start + len(packed) :]
 
 
 def mutator(target: Target) -> Callable[[bytes, int, int], bytes]:
@@ -66,22 +65,23 @@ def mutator(target: Target) -> Callable[[bytes, int, int], bytes]:
     def mutate(data: bytes, most: int, seed: int) -> bytes:
         dice = random.Random(seed)
         *before, last = data.split(CUT)
-        found: bytes | None = None
         if dice.random() < 0.7 and target.json:
             lines = last.split(b"\n") if b"\n{" in last else [last]
             k = dice.randrange(len(lines))
             changed = changed_json(lines[k], dice)
-            found = None if changed is None else b"\n".join([*lines[:k], changed, *lines[k + 1 :]])
+            if changed is not None:
+                whole = CUT.join([*before, b"\n".join([*lines[:k], changed, *lines[k + 1 :]])])
+                if len(whole) <= most:
+                    return whole
         elif dice.random() < 0.3:
             return changed_numbers(data, dice)[:most]
-        whole = None if found is None else CUT.join([*before, found])
-        return whole if whole is not None and len(whole) <= most else atheris.Mutate(data, most)
+        return atheris.Mutate(data, most)
 
     return mutate
 
 
 def place_of(error: BaseException) -> str:
-    """Name the package's last line in a traceback, and the exception's type."""
+    """Name the package's last line of a traceback, and the exception's type."""
     frames = [f for f in traceback.extract_tb(error.__traceback__) if "bitymi_ns" in f.filename]
     where = f"{Path(frames[-1].filename).name}-{frames[-1].lineno}" if frames else "elsewhere"
     return f"{where}-{type(error).__name__}"
@@ -89,10 +89,10 @@ def place_of(error: BaseException) -> str:
 
 def follow() -> None:
     """Instrument the package for atheris, whose import hook does not see editable installs."""
-    for each in gc.get_objects():
-        if isinstance(each, types.FunctionType) and str(each.__module__).startswith("bitymi_ns."):
+    for function in gc.get_objects():
+        if isinstance(function, types.FunctionType) and str(function.__module__).startswith("bitymi_ns."):
             with contextlib.suppress(Exception):  # some code cannot be rewritten
-                atheris.instrument_func(each)
+                atheris.instrument_func(function)
 
 
 def fuzz(name: str, seconds: int, folder: Path, work: Path) -> None:
@@ -125,7 +125,6 @@ def fuzz(name: str, seconds: int, folder: Path, work: Path) -> None:
 
 
 def main() -> int:
-    """Run the command."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("target", choices=[*TARGETS, "all"])
     parser.add_argument("--seconds", type=int, default=600, help="time for each target")
@@ -151,9 +150,9 @@ def main() -> int:
     for name in TARGETS:
         options = ["--seconds", str(given.seconds), "--findings", str(given.findings)]
         subprocess.run([sys.executable, "-m", "scripts.fuzz", name, *options], check=False)
-    found = sorted(path.name for path in given.findings.iterdir())
-    print(f"{len(found)} findings in {given.findings}: {', '.join(found)}" if found else "nothing was found")
-    return 1 if found else 0
+    findings = sorted(path.name for path in given.findings.iterdir())
+    print(f"{len(findings)} findings in {given.findings}: {', '.join(findings)}" if findings else "nothing was found")
+    return 1 if findings else 0
 
 
 if __name__ == "__main__":

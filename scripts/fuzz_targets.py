@@ -1,4 +1,4 @@
-"""Fuzz targets of scripts/fuzz.py: readers of untrusted files, with seed inputs."""
+"""Targets of scripts/fuzz.py: readers of untrusted files, with seed inputs."""
 
 from __future__ import annotations
 
@@ -45,8 +45,6 @@ CUT = b"\n--8<--\n"  # separates the files of an input
 
 @dataclass
 class Target:
-    """A reader with seed inputs."""
-
     run: Callable[[bytes], object]  # reads an input
     seeds: list[bytes]
     refusals: tuple[type[BaseException], ...] = ()  # documented exceptions
@@ -233,8 +231,7 @@ def report(work: Path) -> Target:
 
 
 def checkpoint(work: Path) -> Target:
-    """Read checkpoints, including the optimisers. An input is a seed for mutations of a valid checkpoint, because its
-    bytes have a checksum."""
+    """Read checkpoints with optimisers. An input chooses mutations of a valid one, whose bytes have a checksum."""
     path = checkpoints.path_of(work, 7)
     tensors = [torch.zeros(3), torch.zeros(0), torch.zeros(5, 3, dtype=torch.int32), torch.zeros(1, 1, 1)]
     tensors += [torch.full((5, 3), 1e30), torch.zeros(5, 3).expand(5, 3).T, torch.zeros(5, 3).to_sparse()]
@@ -242,20 +239,20 @@ def checkpoint(work: Path) -> Target:
     odd: tuple[Any, ...] = (*ODD_VALUES, *tensors, (1, 2), torch.float32, b"a")
 
     def run(data: bytes) -> None:
-        found = atheris.FuzzedDataProvider(data)
+        dice = atheris.FuzzedDataProvider(data)
         value = [state(SceneConfig())]
-        for _ in range(found.ConsumeIntInRange(0, 3)):
+        for _ in range(dice.ConsumeIntInRange(0, 3)):
             places = nodes(value)
-            (holder, key), (other, name) = (places[found.ConsumeIntInRange(0, len(places) - 1)] for _ in range(2))
-            how = found.ConsumeIntInRange(0, 5)
+            (holder, key), (other, name) = (places[dice.ConsumeIntInRange(0, len(places) - 1)] for _ in range(2))
+            how = dice.ConsumeIntInRange(0, 5)
             if how == 0 and holder is not value:
                 del holder[key]
             elif how == 1:
                 holder[key] = copy.deepcopy(other[name])
             elif how == 2 and isinstance(holder, dict):
-                holder[found.ConsumeUnicodeNoSurrogates(8)] = holder.pop(key)
+                holder[dice.ConsumeUnicodeNoSurrogates(8)] = holder.pop(key)
             else:
-                holder[key] = odd[found.ConsumeIntInRange(0, len(odd) - 1)]
+                holder[key] = odd[dice.ConsumeIntInRange(0, len(odd) - 1)]
         try:
             torch.save(value[0], path)
         except Exception:  # cannot be stored, hence not read
@@ -271,7 +268,7 @@ def checkpoint(work: Path) -> Target:
 
 
 def archive(work: Path) -> Target:
-    """Read files of torch.save, by their bytes; an input that is no archive becomes the pickle of one."""
+    """Read files of torch.save; an input that is no archive becomes the pickle of one."""
     path = checkpoints.path_of(work, 7)
     layers = torch.nn.Linear(2, 3).state_dict()
     whole = saved({"step": 7, "pipeline": layers, "optimizers": {"a": [(0.5, None, True, -(2**70))]}})

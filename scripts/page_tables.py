@@ -1,6 +1,5 @@
 #!/usr/bin/env python
-"""Write the page's copy of the package's tables, web/src/bundle/tables.ts: the layout of a surfel in the shaders, kinds
-of view colour, limits."""
+"""Write the page's copy of the package's tables, web/src/bundle/tables.ts."""
 
 import math
 import re
@@ -59,7 +58,7 @@ NUMBERS = {
 
 
 def text_of(value: object) -> str:
-    """Write a value as TypeScript."""
+    """Format a value as TypeScript."""
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key_of(key)}: {text_of(item)}" for key, item in value.items()) + " }"
     if isinstance(value, (list, tuple)):
@@ -74,7 +73,6 @@ def text_of(value: object) -> str:
 
 
 def key_of(key: object) -> str:
-    """Write a key."""
     return str(key) if str(key).isidentifier() else f"'{key}'"
 
 
@@ -85,7 +83,7 @@ def of_width(limit: Limit, width: int) -> list[float]:
 
 def ranges() -> dict[str, list[float]]:
     """List the ranges of bundle.json's numbers by part and key, those of a list's items by the list's."""
-    found = {}
+    by_name = {}
     for part, model in PARTS.items():
         for key, schema in model.model_json_schema()["properties"].items():
             while (
@@ -96,42 +94,42 @@ def ranges() -> dict[str, list[float]]:
                 schema = inner[0]
             if "maximum" in schema:
                 low = schema.get("minimum", math.ulp(schema.get("exclusiveMinimum", 0.0)))
-                found[f"{part}.{key}"] = [low, schema["maximum"]]
-    return found
+                by_name[f"{part}.{key}"] = [low, schema["maximum"]]
+    return by_name
 
 
 def words_of(struct: np.dtype) -> dict[str, int]:
     """List the offsets of a struct's fields in words, by name."""
     return {
-        re.sub(r"_(\w)", lambda part: part[1].upper(), name): at // 4
-        for name, (_, at, *_) in (struct.fields or {}).items()
+        re.sub(r"_(\w)", lambda part: part[1].upper(), name): offset // 4
+        for name, (_, offset, *_) in (struct.fields or {}).items()
     }
 
 
 def at_word(parameter: str) -> tuple[int, int]:
-    """Return a parameter's first word of a surfel, and their number."""
+    """Return a parameter's first word, and their number."""
     field = FIELDS[parameter]
     return (SURFEL.fields or {})[field][1] // 4, math.prod(SURFEL[field].shape)
 
 
 def tables() -> str:
-    """Write the module."""
+    """Compose the module."""
     kinds = VIEW_COLORS.items()
     terms = {name: of_width(kind.reduced_limit, kind.reduced_width) for name, kind in kinds}
     shapes = {name: surfel_codes.term_numbers(name)[1] for name in VIEW_COLORS}
     whole = {}
     for name, kind in kinds:
-        parts = [each for each in kind.parameters if -1 in each.shape]
-        base = [each.name for each in kind.parameters if -1 not in each.shape]
+        parts = [parameter for parameter in kind.parameters if -1 in parameter.shape]
+        base = [parameter.name for parameter in kind.parameters if -1 not in parameter.shape]
         form = f"{name}{WHOLE}" if kind.sites else name
-        terms[form] = [most for each in parts for most in of_width(each.limit, each.width)]
+        terms[form] = [most for part in parts for most in of_width(part.limit, part.width)]
         whole[name] = {
             "parts": {p.name: p.width for p in parts},
             "base": base[0] if base else None,
             "kind": KINDS[form],
         }
     stored = {name: [*at_word(name), LIMITS[name][0]] for name in FIELDS if math.isfinite(LIMITS[name][0])}
-    found = {
+    values = {
         "FORMAT": manifest.FORMAT,
         "NEWEST_MAJOR": int(manifest.VERSION.split(".")[0]),
         "EARLIER": manifest.EARLIER,
@@ -175,7 +173,7 @@ def tables() -> str:
         **{name: getattr(module, name) for module, names in NUMBERS.items() for name in names.split()},
     }
     lines = ["// Written by scripts/page_tables.py."]
-    for name, value in found.items():
+    for name, value in values.items():
         named = f"{name}: {TYPES[name]}" if name in TYPES else name
         end = "" if name in TYPES or isinstance(value, (str, int, float)) else " as const"
         text = f"export const {named} = {text_of(value)}{end};"

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Print the project's requirements with its dev extra, one per line without spaces, for the Makefile's pip call."""
+"""Print the requirements with the dev extra, one per line without spaces, for the Makefile's pip call."""
 
 import re
 import sys
@@ -12,7 +12,6 @@ else:
 
 
 def main() -> None:
-    """Read pyproject.toml beside this folder and print."""
     pyproject = Path(__file__).resolve().parent.parent / "pyproject.toml"
     project = tomllib.loads(pyproject.read_text(encoding="utf-8"))["project"]
     for requirement in project["dependencies"] + project["optional-dependencies"]["dev"]:

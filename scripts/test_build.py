@@ -1,9 +1,7 @@
 #!/usr/bin/env python
 """Run tests with another build of the CPU kernels than the installed one: scripts/test_build.py BUILD_FOLDER TEST...
 
-The build may be by another compiler, for another CPU, or with sanitizers (`--sanitizers`), whose libraries must be
-preloaded: the script then restarts itself with them.
-"""
+With `--sanitizers`, whose libraries must be preloaded, the script restarts itself."""
 
 import argparse
 import importlib.util
@@ -12,26 +10,25 @@ import subprocess
 import sys
 from pathlib import Path
 
-LIBRARIES = ("libasan.so", "libubsan.so")
+LIBRARIES = ("libasan.so", "libubsan.so", "libstdc++.so")
+"""The last one so that the sanitizer intercepts C++ exceptions of libraries loaded later."""
 
 
 def preload() -> str:
-    """Return LD_PRELOAD for the compiler's sanitizer libraries."""
+    """Return LD_PRELOAD for the sanitizers."""
     compiler = os.environ.get("CXX", "c++")
     paths = []
     for name in LIBRARIES:
-        found = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
-        path = Path(found.stdout.strip())
+        printed = subprocess.run([compiler, f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+        path = Path(printed.stdout.strip())
         if not path.is_absolute():
-            sys.exit(f"{compiler} has no {name}: install the sanitizers of the compiler (gcc brings them)")
+            sys.exit(f"{compiler} has no {name}: install the compiler's sanitizers")
         paths.append(str(path.resolve()))
-    # preloaded, so that the sanitizer intercepts C++ exceptions of libraries loaded later
-    stdcpp = subprocess.run([compiler, "-print-file-name=libstdc++.so"], capture_output=True, text=True, check=True)
-    return ":".join([*paths, str(Path(stdcpp.stdout.strip()).resolve())])
+    return ":".join(paths)
 
 
 def main() -> int:
-    """Load the build in place of the installed kernels and run the tests; return the exit status."""
+    """Load the build in place of the installed kernels, and run the tests."""
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("build", type=Path, help="CMake's folder")
     parser.add_argument("tests", nargs="+", help="what pytest is to run")

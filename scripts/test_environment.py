@@ -3,9 +3,9 @@
 scripts/test_environment.py --work FOLDER [--data CAPTURE] [--end oldest|newest]
 
 The oldest is nerfstudio's documented environment, in which pip must change nothing. The newest is what pip gives
-without constraints.txt, and then the newest releases of what nerfstudio's requirements hold back. The versions found
-of what the package requires, and of what pip must leave alone, are written to scripts/environments, which
-tests/scripts compares with pyproject.toml."""
+without constraints.txt, with the newest releases of what nerfstudio's requirements hold back. The versions of what the
+package requires, and of what pip must leave alone, are written to scripts/environments, which tests/scripts compares
+with pyproject.toml."""
 
 import argparse
 import os
@@ -37,10 +37,10 @@ class Environment:
 
     def run(self, program: str, *words: object, cwd: Path | None = None) -> str:
         """Run a program of the environment and return its output; exit if it fails."""
-        found = self.folder / "venv" / "bin"
-        variables = {"OMP_NUM_THREADS": "2"} | os.environ | {"PATH": f"{found}:{os.environ['PATH']}"}
+        programs = self.folder / "venv" / "bin"
+        variables = {"OMP_NUM_THREADS": "2"} | os.environ | {"PATH": f"{programs}:{os.environ['PATH']}"}
         print("+", program, *words, flush=True)
-        command = [found / program, *map(str, words)]
+        command = [programs / program, *map(str, words)]
         done = subprocess.run(
             command, cwd=cwd or self.folder, env=variables, stdout=subprocess.PIPE, text=True, check=False
         )
@@ -52,25 +52,25 @@ class Environment:
         return self.run("python", "-m", "pip", "--disable-pip-version-check", *words)
 
     def versions(self) -> dict[str, str]:
-        """Return the installed packages' versions by name, in lower case."""
+        """Return the packages' versions by name, in lower case."""
         pairs = (line.split("==") for line in self.pip("list", "--format=freeze").splitlines())
         return dict(sorted((name.lower().replace("_", "-"), version) for name, version in pairs))
 
 
 def interpreter_of(version: str) -> str:
     """Find a Python on PATH that runs and has venv; exit with its name if there is none."""
-    found = shutil.which(f"python{version}")
-    tried = found and subprocess.run([found, "-c", "import ensurepip, venv"], capture_output=True, check=False)
-    if found and tried and tried.returncode == 0:
-        return found
+    path = shutil.which(f"python{version}")
+    tried = path and subprocess.run([path, "-c", "import ensurepip, venv"], capture_output=True, check=False)
+    if path and tried and tried.returncode == 0:
+        return path
     sys.exit(
-        f"No 'python{version}' {f'that runs and has venv ({found} does not)' if found else 'found'} on PATH: install "
-        f"Python {version} with venv, or name the other end alone (make test-environment ENDS=...)"
+        f"No 'python{version}' {f'that runs and has venv ({path} does not)' if path else 'found'} on PATH: install it "
+        "with venv, or name the other end alone (make test-environment ENDS=...)"
     )
 
 
 def try_commands(environment: Environment, data: Path | None) -> None:
-    """Train a capture, or the sample room, go on with the run, evaluate and export it."""
+    """Train a capture or the sample room, go on with the run, evaluate and export it."""
     folder, train = environment.folder, ["bitymi", "--vis", "tensorboard", "--output-dir", "runs", "--timestamp", "run"]
     if data is None:
         data = folder / "room"
@@ -101,15 +101,16 @@ def try_end(name: str, work: Path, data: Path | None) -> None:
     environment.pip("install", "-q", wheel)
     after = environment.versions()
     print(f"{name}: pip adds {sorted(after.keys() - before.keys())}")
-    if changed := {each for each in before if after.get(each) != before[each]} & KEPT:
+    if changed := {package for package in before if after.get(package) != before[package]} & KEPT:
         sys.exit(f"test environment: pip changes {sorted(changed)} of the {name} environment")
     if renewed:
         environment.pip("install", "-q", "--upgrade", "--no-deps", *renewed)
     required = environment.pip("show", "bitymi-ns").split("Requires: ")[1].splitlines()[0].lower().replace("_", "-")
     recorded = KEPT | {*required.split(", ")}
-    found = "".join(f"{each}=={version}\n" for each, version in environment.versions().items() if each in recorded)
+    versions = environment.versions().items()
+    lines = "".join(f"{package}=={version}\n" for package, version in versions if package in recorded)
     python = environment.run("python", "-c", "import platform; print(platform.python_version())").strip()
-    (FOUND / f"{name}.txt").write_text(f"# Python {python}: written by scripts/test_environment.py\n{found}", "utf8")
+    (FOUND / f"{name}.txt").write_text(f"# Python {python}: written by scripts/test_environment.py\n{lines}", "utf8")
     try_commands(environment, data)
     try_tests(environment)
 
@@ -125,7 +126,6 @@ def try_tests(environment: Environment) -> None:
 
 
 def main() -> None:
-    """Try the environments named, or both; find their interpreters first."""
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("--end", action="append", choices=list(ENDS), help="one of the two; may be repeated")
     parser.add_argument("--data", type=Path, help="a capture; the sample room without")

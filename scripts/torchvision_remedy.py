@@ -2,8 +2,8 @@
 """Make a CUDA build of torchvision importable beside a CPU build of torch, in this virtual environment.
 
 Without this, `import torchvision`, and so nerfstudio, fails with "operator torchvision::nms does not exist". The better
-solution is the matching CPU wheel (https://download.pytorch.org/whl/cpu). If the import fails with just this message,
-this script adds two files to site-packages that declare the missing operators when torchvision is imported."""
+solution is the matching CPU wheel (https://download.pytorch.org/whl/cpu). Only on this message the script adds two
+files to site-packages that declare the missing operators when torchvision is imported."""
 
 import subprocess
 import sys
@@ -59,21 +59,19 @@ sys.meta_path.insert(0, _Finder())
 
 
 def shim_files() -> tuple[Path, Path]:
-    """Return the paths in site-packages of the shim module and of the .pth file that loads it at start-up."""
+    """Return the paths of the shim module and of the .pth file that loads it at start-up."""
     site = Path(sysconfig.get_paths()["purelib"])
     return site / f"{SHIM_NAME}.py", site / f"{SHIM_NAME}.pth"
 
 
 def import_error() -> str:
-    """Return the error output of `import torchvision` in a new interpreter; empty on success."""
-    # not from the current folder
+    """Return the error output of `import torchvision` in a new interpreter, not from the current folder."""
     code = "import sys; sys.path[:] = [folder for folder in sys.path if folder]; import torchvision"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     return result.stderr if result.returncode else ""
 
 
 def main() -> int:
-    """Apply the remedy; return 0 if torchvision can be imported afterwards."""
     if sys.prefix == sys.base_prefix:
         print("torchvision remedy: run this with the Python of a virtual environment", file=sys.stderr)
         return 2

@@ -1,9 +1,9 @@
 #!/usr/bin/env python
 """Build the wheel as `pip install .` does, check its contents, install it in isolation and run tests against it.
 
-The build starts from an empty folder with only PATH, HOME and TMPDIR of the environment, and without the CUDA kernels,
-which take minutes. The wheel is installed to a new virtual environment that finds the dependencies of this one, but not
-the checkout: the tests run on a copy of their folder, those of the kernels with each module that this CPU can run.
+The build starts from an empty folder with only PATH, HOME and TMPDIR of the environment, without the CUDA kernels. The
+wheel is installed to a new virtual environment that finds the dependencies of this one, but not the checkout: tests run
+on a copy of their folder, those of the kernels with each module that this CPU can run.
 """
 
 import os
@@ -64,13 +64,13 @@ def build(folder: Path) -> Path:
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
     options = ("-q", "--no-build-isolation", "--no-deps", "--no-index")
     settings = ("cmake.define.BITYMI_CUDA=OFF", f"build-dir={folder / 'build'}")
-    run(*pip, "wheel", *options, *(f"--config-settings={each}" for each in settings), "-w", folder, ROOT)
+    run(*pip, "wheel", *options, *(f"--config-settings={setting}" for setting in settings), "-w", folder, ROOT)
     (wheel,) = folder.glob("bitymi_ns-*.whl")
     return wheel
 
 
 def expected() -> set[str]:
-    """List the expected files of the wheel, without metadata: package, presets, and compiled modules."""
+    """List the wheel's expected files, without metadata."""
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "bitymi_ns", "method_configs"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     files = {line.replace("method_configs/", "bitymi_ns/method_configs/") for line in listed.stdout.splitlines()}
@@ -84,19 +84,16 @@ def check_contents(wheel: Path) -> None:
         files = {name for name in archive.namelist() if ".dist-info/" not in name}
     if files != expected():
         missing, superfluous = sorted(expected() - files), sorted(files - expected())
-        sys.exit(
-            f"wheel test: {wheel.name} lacks {missing or 'nothing'} and should not hold {superfluous or 'nothing'}"
-        )
+        sys.exit(f"wheel test: {wheel.name} lacks {missing}, and should not hold {superfluous}")
     print(f"{wheel.name}: {len(files)} files, {wheel.stat().st_size / 1e6:.1f} MB")
 
 
 def install(wheel: Path, folder: Path) -> Path:
-    """Create a virtual environment with the wheel and access to this one's packages; return its interpreter."""
+    """Create a virtual environment with the wheel and this one's packages; return its interpreter."""
     run(sys.executable, "-m", "venv", "--without-pip", folder)
     python = folder / "bin" / "python"
     site = folder / SITE_PACKAGES.relative_to(sys.prefix)
-    # a folder named in a .pth file is searched, but its own .pth files (of the editable install) are not read; that of
-    # scripts/torchvision_remedy.py must be
+    # .pth files of a folder that a .pth file names (the editable install's) are not read; torchvision_remedy's must be
     lines = [str(SITE_PACKAGES)] + [f"import {path.stem}" for path in SITE_PACKAGES.glob("_torchvision*.pth")]
     (site / "dependencies.pth").write_text("\n".join(lines) + "\n", encoding="utf8")
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", python)
@@ -105,7 +102,6 @@ def install(wheel: Path, folder: Path) -> Path:
 
 
 def main() -> None:
-    """Build the wheel, check its contents, install it and run the tests."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
         wheel = build(folder)

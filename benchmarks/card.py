@@ -1,9 +1,9 @@
 #!/usr/bin/env python
 """Transfer the package to a bare machine with a GPU, and run tests and benchmarks there.
 
-`card.py stage FILE.tar --python python3.12` compiles the wheel for that Python and GPU, downloads its dependencies and
-nerfstudio, except torch and numpy, and archives them. `card.py run ORDER... --stage FILE.tar --output RESULTS` unpacks
-them on the machine and runs the orders; each step has its own time limit."""
+`card.py stage FILE.tar --python python3.12` archives the wheel for that Python and GPU, with its dependencies and
+nerfstudio, except torch and numpy. `card.py run ORDER... --stage FILE.tar --output RESULTS` unpacks them on the machine
+and runs the orders."""
 
 import argparse
 import os
@@ -96,7 +96,7 @@ def stage(arguments: argparse.Namespace) -> None:
 
 
 def unpack(archive: Path, work: Path) -> dict[str, str]:
-    """Install the wheels to a folder, copy the checkout with their compiled modules, and return the environment."""
+    """Install the wheels, copy the checkout with their compiled modules, and return the environment."""
     site = work / "site"
     subprocess.run(["tar", "-C", work, "-xf", archive.absolute()], check=True)
     command = [sys.executable, "-m", "pip", "install", "-q", "--no-index", "--no-deps", "--no-compile", "--target"]
@@ -142,7 +142,6 @@ def run_step(step: Step, tree: Path, environment: dict[str, str], logs: Path, de
 
 
 def main() -> int:
-    """Stage the wheels or run the orders; return the exit status."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False
     )

@@ -53,9 +53,9 @@ class Limit:
     title: str
     better: str  # direction, "more" or "less"
     by: float  # largest allowed change for the worse
-    relative: bool = True  # `by` is a share of the baseline, not a difference
+    relative: bool = True  # `by` is a share of the baseline
     digits: int = 0  # decimals to print
-    timed: bool = False  # depends on the processor; compared only on the baseline's model
+    timed: bool = False  # compared only on the baseline's processor
 
 
 LIMITS = {
@@ -109,8 +109,7 @@ class Calibration:
         return lambda *_: self.run() if next(calls) % n == 0 else None
 
     def timed(self, work: Callable[[], Any]) -> tuple[Any, float]:
-        """Run `work`; return its result, and its CPU time in medians of the calibration runs during it (else after
-        it)."""
+        """Return the result of `work`, and its CPU time in medians of the calibration runs during or after it."""
         self.seconds.clear()
         start = time.process_time()
         result = work()
@@ -180,8 +179,8 @@ def measure() -> Figures:
 
 
 def judge(figures: Figures, baseline: Figures, same_cpu: bool) -> tuple[list[list[str]], list[str]]:
-    """Compare the figures with the baseline: rows of the table, and the names of those that are worse. Not judged are
-    times on another processor model, and LPIPS without its weights."""
+    """Compare the figures with the baseline: rows of the table, and names of what is worse. LPIPS without its weights
+    is not judged."""
     rows, worse = [], []
     for key, limit in LIMITS.items():
         before, now = baseline.get(key), figures[key]
@@ -228,7 +227,7 @@ def main(accept: bool = False, baseline: Path = BASELINE) -> None:
     if not same_cpu:
         print(
             f"\nThe baseline is of {stored['processor']}, this is {processor()}: times are not judged, and the other "
-            f"figures may be worse by {ELSEWHERE:g} times as much, because kernels round differently there."
+            f"figures may be worse by {ELSEWHERE:g} times as much, as kernels round differently."
         )
     if accept:
         rounded = {name: round(value, 5) for name, value in figures.items() if not math.isnan(value)}

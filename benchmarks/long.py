@@ -99,7 +99,7 @@ class LongRun:
 
 
 def preset_of(row: str) -> Preset:
-    """Load the preset of a row and apply its settings. Raises ValueError: an option does not exist."""
+    """Load the preset of a row with its settings. Raises ValueError: an option does not exist."""
     name, *settings = shlex.split(row)
     preset = load_preset(name)
     for setting in settings:

@@ -25,7 +25,7 @@ from bitymi_ns.train.views import View
 
 SITES = 7
 CROSSING = 0.016  # share of the surfels that cross the camera's plane out of view
-PIXEL_SCALE = 0.9  # median scale of a surfel, relative to the side of its share of the image
+PIXEL_SCALE = 0.9  # median scale of a surfel, in sides of its share of the image
 
 
 def trained_like(n: int, width: int, height: int, device: torch.device, texture: bool = True) -> tuple[Scene, Camera]:

@@ -108,9 +108,9 @@ def frames(
     Args:
         surfels: Sizes of the synthetic scenes (`scenes.textured`).
         sizes: Widths and heights of the images.
-        bundles: Bundles to draw as well, from three cameras around their centre.
+        bundles: Bundles to draw as well, from three sides.
         runs: Timed frames, after ten untimed ones.
-        emulated: Try the script without a GPU, by the kernels' host emulation, whose times mean nothing.
+        emulated: Try the script without a GPU, by host emulation.
         output: Also write the Markdown to this file.
     """
     if emulated:
@@ -153,8 +153,7 @@ def baked(n: int, width: int, height: int, device: torch.device) -> Run:
 
 
 def training(n: int, width: int, height: int, device: torch.device, tiled: bool = False, most: int = 0) -> Run:
-    """Prepare a training step: render, loss 0.8 L1 + 0.2 (1 - SSIM), backward and Adam, with the field, or with texels
-    if `tiled`. `most`: limit of a fragment list, 0 = none."""
+    """Prepare a training step with the field, or with texels if `tiled`. `most`: limit of a fragment list, 0 = none."""
     scene, camera = (with_texels if tiled else trained_like)(n, width, height, device)
     scene.config.max_fragments = most
     # rates 0: the work of a step without changing the scene

@@ -60,7 +60,7 @@ def main() -> int:
 
     assert Path(_cpu.__file__) == module, f"{_cpu.__file__} is used instead of {module}"
     print(f"{module}: {_cpu.CPU_FEATURES or 'no extensions of the instruction set'}", flush=True)
-    # without capturing, because a sanitizer's finding ends the process before captured output is printed
+    # not captured, as a sanitizer's finding ends the process
     uncaptured = ["-x", "-s"] if options.sanitizers else []
     return pytest.main(["-q", *uncaptured, "-p", "no:cacheprovider", *options.tests])
 

@@ -58,7 +58,7 @@ class Environment:
 
 
 def interpreter_of(version: str) -> str:
-    """Find a Python on PATH that runs and has venv; exit with its name if there is none."""
+    """Find a Python on PATH that runs and has venv; exit if there is none."""
     path = shutil.which(f"python{version}")
     tried = path and subprocess.run([path, "-c", "import ensurepip, venv"], capture_output=True, check=False)
     if path and tried and tried.returncode == 0:
@@ -90,7 +90,7 @@ def try_commands(environment: Environment, data: Path | None) -> None:
 
 
 def try_end(name: str, work: Path, data: Path | None) -> None:
-    """Make the environment, install the wheel, write the versions found, and run commands and tests."""
+    """Try one environment, and write the versions found."""
     version, first, renewed = ENDS[name]
     environment = Environment(interpreter_of(version), work / name)
     for packages in first:

@@ -60,7 +60,6 @@ def run(*command: str | Path, cwd: Path = ROOT) -> None:
 
 
 def build(folder: Path) -> Path:
-    """Build the wheel in `folder` and return its path."""
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check")
     options = ("-q", "--no-build-isolation", "--no-deps", "--no-index")
     settings = ("cmake.define.BITYMI_CUDA=OFF", f"build-dir={folder / 'build'}")

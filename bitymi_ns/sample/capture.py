@@ -23,7 +23,7 @@ from .room import Room
 FOCAL = 0.80  # focal length in image widths
 BAND = 1 << 16  # rays traced at a time
 CAPTURE, CLOUD = "transforms.json", "sparse_pc.ply"
-MADE_BY = "bitymi sample"  # marks transforms.json: only folders with this mark are overwritten
+MADE_BY = "bitymi sample"  # in transforms.json of folders that may be overwritten
 
 
 class RoomView(NamedTuple):
@@ -55,17 +55,13 @@ def look_at(eye: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np
 
 def camera_path(views: int, width: int, height: int, seed: int) -> list[RoomView]:
     """Generate two orbits around the objects, at varying heights, towards targets with random offsets."""
-    rng = np.random.default_rng([seed, 1])
-    path = []
-    for k in range(views):
-        s = (k + 0.5) / views
-        angle = 4 * np.pi * s
-        reach = 1 + 0.10 * np.sin(7 * 2 * np.pi * s)
-        eye = np.array([2.25 * reach * np.cos(angle), 1.75 * reach * np.sin(angle), 0.0])
-        eye[2] = (0.75 if s < 0.5 else 1.55) + 0.30 * np.sin(5 * 2 * np.pi * s)
-        target = [0.0, 0.0, 0.72] + rng.uniform(-0.25, 0.25, 3)
-        path.append(RoomView(look_at(eye, target), FOCAL * width, width, height))
-    return path
+    s = (np.arange(views) + 0.5) / views
+    angle, reach = 4 * np.pi * s, 1 + 0.10 * np.sin(7 * 2 * np.pi * s)
+    z = np.where(s < 0.5, 0.75, 1.55) + 0.30 * np.sin(5 * 2 * np.pi * s)
+    eyes = np.stack([2.25 * reach * np.cos(angle), 1.75 * reach * np.sin(angle), z], axis=1)
+    targets = [0.0, 0.0, 0.72] + np.random.default_rng([seed, 1]).uniform(-0.25, 0.25, (views, 3))
+    poses = [look_at(eye, target) for eye, target in zip(eyes, targets, strict=True)]
+    return [RoomView(pose, FOCAL * width, width, height) for pose in poses]
 
 
 def render(room: Room, view: RoomView, supersample: int = 3) -> NDArray[np.uint8]:
@@ -90,8 +86,8 @@ def first_hits(
 def sparse_points(
     room: Room, views: list[RoomView], images: list[NDArray[np.uint8]], count: int, seed: int
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Sample exact surface points [count, 3] and their pixels' colors [count, 3], more where a view has corners, as
-    structure from motion finds them (by the root of a pixel's smaller eigenvalue)."""
+    """Sample exact surface points [count, 3] with their pixels' colors [count, 3], more where a view has corners, as
+    structure from motion does."""
     rng = np.random.default_rng([seed, 2])
     points, colors = [], []
     shares = np.diff(np.linspace(0, count, len(views) + 1).astype(int))
@@ -124,7 +120,6 @@ def generate(
     output_dir = Path(output_dir).absolute()
 
     def check() -> None:
-        """Check that the folder holds nothing, or an earlier sample alone."""
         files = None
         with suppress(FileNotFoundError, NotADirectoryError, ValueError, AttributeError):
             if read_json(output_dir / CAPTURE).get("made_by") == MADE_BY:

@@ -181,7 +181,7 @@ class Room:
         return result
 
     def _solid_color(self, solid: Solid, p: Image, d: Image, mirrors: bool) -> Image:
-        """Compute colors [n, 3] of points on a solid, viewed along d."""
+        """Compute colors [n, 3] of points, viewed along d."""
         normal, u, v = solid.normals(p)
         if solid.color == "stripes":
             base = np.array([[0.85, 0.20, 0.15], [0.85, 0.85, 0.82]], np.float32)[(p[2] * 8).astype(int) % 2]

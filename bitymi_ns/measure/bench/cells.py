@@ -16,8 +16,8 @@ from bitymi_ns.trust import json_of, no_links
 from .process import BenchError
 
 FILE = "cells.jsonl"
-NAMES = ("suite", "row")  # entries of a key that are labels, not part of its identity
-NOT_OF_A_RUN = ("cell", "bundle", "export")  # entries of a key in which the cells of a run differ
+NAMES = ("suite", "row")  # entries of a key that are labels
+NOT_OF_A_RUN = ("cell", "bundle", "export")  # entries in which the cells of a run differ
 
 
 def identity(key: dict[str, Any], *without: str) -> str:
@@ -62,7 +62,6 @@ class Cells:
                 raise BenchError(f"{reason}: remove that line, or give another --work") from error
 
     def get(self, key: dict[str, Any]) -> dict[str, Any] | None:
-        """Return a finished cell, or None."""
         return self.known.get(identity(key))
 
     def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:

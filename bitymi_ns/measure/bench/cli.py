@@ -27,15 +27,15 @@ FAILED, INTERRUPTED = 1, 130  # exit statuses after a failed cell and after Ctrl
 class BenchRun:
     """Train, bake and evaluate a matrix of scenes, methods and seeds."""
 
-    data: tuple[Path, ...]  # local: folders of captures. A standard data set: the folder of its scenes.
+    data: tuple[Path, ...]  # Folders of captures, or the folder of a standard data set's scenes.
     scenes: tuple[str, ...] = ()  # Only these scenes of a standard data set.
     methods: tuple[str, ...] = ("bitymi",)  # Methods of ns-train.
     plan: PlanName | None = None  # Rows to train, and bundles to bake, instead of --methods and --formats.
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
     seeds: tuple[int, ...] = ()  # Train once per seed; none = once, with the method's own.
-    steps: int | None = None  # Steps of a training; schedules scale with it. None = the method's own.
-    formats: tuple[Format, ...] = get_args(Format)  # Bundle formats to bake each trained scene to; none = no baking.
+    steps: int | None = None  # Length of a training. None = the method's own.
+    formats: tuple[Format, ...] = get_args(Format)  # Bundle formats to bake each trained scene to.
     work: Path = Path("outputs/bench")
     """Folder of runs, bundles, logs and finished cells, which are not run again. Processes on different GPUs or
     machines may share it: each takes runs that no other is working on."""

@@ -40,8 +40,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class Cell(Scene):
-    """A training, or an evaluation or export of its scene or bundle. The fields are all settings that affect the
-    result."""
+    """A training, evaluation or export: all settings that affect its result."""
 
     row: str = ""
     method: str = ""
@@ -64,7 +63,7 @@ class Cell(Scene):
 
     @property
     def folder(self) -> str:
-        """Path of the run below runs/, bundles/, evals/ and logs/ of the work folder: its settings, and their hash."""
+        """Path of the run below runs/, bundles/, evals/ and logs/ of the work folder."""
         digest = hashlib.sha256(identity(self.key, *NOT_OF_A_RUN).encode()).hexdigest()[:8]
         length = "own-length" if self.steps is None else f"{self.steps}-steps"
         seed = "" if self.seed is None else f"-seed{self.seed}"
@@ -77,14 +76,13 @@ class Cell(Scene):
 
     @property
     def output(self) -> Path:
-        """Path in the work folder of the output: a folder, or an evaluation's file, beside the folder of its
-        pictures."""
+        """Path in the work folder of the output: a folder, or an evaluation's file."""
         folders = {"train": Path("runs", self.folder), "export": Path("bundles", self.folder, self.form)}
         return folders.get(self.cell, Path("evals", self.folder, f"{self.form}.json"))
 
     @property
     def parent(self) -> "Cell":
-        """The cell whose config.yml this one uses; the training itself for the training."""
+        """The cell whose config.yml this one uses; of a training itself."""
         if self.cell == "eval" and self.bundle:
             return replace(self, cell="export")
         return replace(self, cell="train", bundle="", export=())
@@ -109,8 +107,8 @@ def chains(
     seeds: Sequence[int] = (),
     steps: int | None = None,
 ) -> list[Chain]:
-    """List the cells of each run in the order of their dependencies: each row is trained on each scene with each seed
-    (empty: once, with the method's own), then baked to each bundle."""
+    """List the cells of each run, in the order of their dependencies: each row is trained on each scene with each seed
+    (empty: the method's own), then baked to each bundle."""
     listed: list[Chain] = []
     for scene, (name, row), seed in product(scenes, rows.items(), list(seeds) or [None]):
         train = Cell(**vars(scene), row=name, method=row.method, options=row.options, seed=seed, steps=steps)

@@ -18,7 +18,7 @@ GRACE = 20.0  # seconds between terminating and killing a command
 
 
 class BenchError(ValueError):
-    """The benchmark cannot be run; the message says what to change."""
+    """The benchmark cannot be run."""
 
 
 class CommandFailed(BenchError):
@@ -27,10 +27,8 @@ class CommandFailed(BenchError):
 
 def run_measured(command: Sequence[str], log: Path, lock: Lock | None = None) -> dict[str, float]:
     """Run a command with its output in a file; return `process_seconds`, `process_cpu_seconds` and `peak_bytes` of it
-    with all threads and children. An interrupt terminates the command first. Raises CommandFailed.
-
-    `lock`: inherited by the command and labelled with its process, so that it stays locked if this process is killed.
-    """
+    with all threads and children. Raises CommandFailed. `lock`: inherited by the command and labelled with its process,
+    so that it stays locked if this process is killed."""
     log.parent.mkdir(parents=True, exist_ok=True)
     start = time.perf_counter()
     with open(log, "wb", opener=no_links) as out:

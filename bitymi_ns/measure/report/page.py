@@ -37,7 +37,6 @@ def compose(records: Records, title: str) -> dict[str, Any]:
 
 
 def to_page(content: dict[str, Any]) -> str:
-    """Render the page."""
     return rendered("report.html.j2", content=content, generator=GENERATOR, columns=NOTES, error_scale=ERROR_SCALE)
 
 

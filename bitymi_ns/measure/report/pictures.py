@@ -18,7 +18,7 @@ from .records import grouped
 
 SIDE_BY_SIDE = re.compile(r"eval_img_(\d{4,})\.png$", re.IGNORECASE)
 """File name of a photograph beside its render, as ns-eval writes it."""
-ERROR_SCALE = 0.25  # error shown as yellow: mean absolute difference over the channels
+ERROR_SCALE = 0.25  # mean absolute difference shown as yellow
 MAX_SETS = 4  # sets of photographs per page
 MAX_WIDTH = 1200  # of embedded images, pixels
 RANKS = {"Worst view": 0.0, "Median view": 0.5, "Best view": 1.0}
@@ -94,8 +94,8 @@ def _columns(views: dict[str, View]) -> list[list[Picture]]:
 
 
 def compare_views(images: Sequence[Path], notes: list[str]) -> list[Group]:
-    """Choose and draw views among images of photographs beside renders, in groups of folders that show the same
-    photographs; appends a note for unreadable images. Views are ranked by PSNR, averaged over the folders."""
+    """Choose and draw views, ranked by their PSNR averaged over the folders that show the same photographs; appends a
+    note for unreadable images."""
     folders: dict[Path, dict[int, View]] = {}
     for path in sorted(p.resolve() for p in images):
         match = SIDE_BY_SIDE.match(path.name)

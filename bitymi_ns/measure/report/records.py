@@ -24,8 +24,8 @@ class Evaluation:
     scene: str  # experiment name
     method: str  # which a bundle shares with its trained scene
     baked: bool  # True for a bundle
-    label: str  # for tables, unique within its scene and stage after `disambiguate`
-    results: dict[str, float]  # finite numbers by name (psnr, ssim, render_ms, bundle_bytes, ...)
+    label: str  # unique within its scene and stage after `disambiguate`
+    results: dict[str, float]  # finite numbers
     source: Path
     group: str = ""  # label without the seed; empty: not grouped over seeds
     series: str = ""  # identity of the training run without its seed
@@ -55,7 +55,7 @@ class Records:
 
     evaluations: list[Evaluation] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
-    images: list[Path] = field(default_factory=list)  # photographs beside renders, as ns-eval writes them
+    images: list[Path] = field(default_factory=list)  # photographs beside renders
     machines: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
@@ -78,8 +78,7 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
 
 def link(records: Records) -> None:
     """Make labels unique; add to evaluations of files the training times of the only curve of their scene and method,
-    and to bundles the difference from their trained scene (`psnr_delta`): the only one of the same scene and method, or
-    of these the only one in the same folder."""
+    and to bundles the difference from the only trained scene (`psnr_delta`) of these, or in the same folder."""
     disambiguate(records.evaluations)
     disambiguate(records.curves)
     of_files = [row for row in records.evaluations if not row.series]  # those of a benchmark state both
@@ -99,7 +98,7 @@ def link(records: Records) -> None:
 
 
 def grouped(items: Iterable[T], key: Callable[[T], K]) -> dict[K, list[T]]:
-    """Group items by their keys, in the order of the first of each."""
+    """Group items by their keys, in order."""
     groups: dict[K, list[T]] = {}
     for item in items:
         groups.setdefault(key(item), []).append(item)

@@ -134,7 +134,7 @@ def quality_tables(evaluations: list[Evaluation]) -> list[Table]:
 
 
 def to_markdown(table: Table) -> str:
-    """Format a table as Markdown, without its title."""
+    """Format a table without its title."""
     rows = []
     for row in table.rows:
         cells = [escaped(text) for text in row.cells]

@@ -71,11 +71,11 @@ class Errors(NamedTuple):
     worst: str  # parameter with the largest error of its gradient
     flipped: float  # share of flipped pixels
     drawn: int  # blended fragments of the reference
-    finite: bool  # True if all images and gradients of the backend are finite, over all pixels
+    finite: bool  # all images and gradients of the backend, over all pixels
 
     @property
     def pairs(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Errors of images and of gradients, each with what rounded inputs cause."""
+        """Errors of images and of gradients, with what rounded inputs cause."""
         return (self.forward, self.input_forward), (self.gradient, self.input_gradient)
 
 
@@ -99,8 +99,7 @@ def _same(got: _Result, want: _Result) -> Tensor:
 def measure(
     case: SceneCase, backend: Backend, dtype: torch.dtype = torch.float32, near: float = 0.2, way: Way = PLAIN
 ) -> Errors:
-    """Compare renders and gradients of a backend with the reference's, from inputs rounded to `dtype`. `near`: near
-    plane, camera z."""
+    """Compare renders and gradients of a backend with the reference's, from inputs rounded to `dtype`."""
     rounded = _map(way.of(case), lambda t: t.to(dtype).double())
     with backend.use():
         got = _by_kernels(rounded, backend.device, dtype, near)

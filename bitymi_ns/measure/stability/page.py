@@ -17,7 +17,7 @@ from .errors import PROBES, Backend, Errors, measure
 from .scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Way, extreme_scenes
 
 ACCURATE = 1e-4  # largest error that counts as accurate
-ALLOWANCE = 4.0  # an error of at most this many times the effect of rounding the inputs is `LIMITED`
+ALLOWANCE = 4.0  # an error of at most so many times the effect of rounding the inputs is `LIMITED`
 LIMITED, NOTHING = "as the inputs allow", "nothing drawn"  # verdicts
 
 
@@ -30,7 +30,6 @@ class SceneErrors(NamedTuple):
 
     @property
     def verdict(self) -> str:
-        """Verdict, as explained on the page."""
         both = (self.single, self.double)
         if not all(e.finite for e in both):
             return "**not finite**"
@@ -45,7 +44,6 @@ class SceneErrors(NamedTuple):
 
 
 def measure_row(label: str, scene: SceneCase, backend: Backend, near: float = 0.2, way: Way = PLAIN) -> SceneErrors:
-    """Measure one scene in float32 and float64."""
     return SceneErrors(label, *(measure(scene, backend, dtype, near, way) for dtype in (torch.float32, torch.float64)))
 
 

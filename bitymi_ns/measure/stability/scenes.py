@@ -92,7 +92,7 @@ def extreme_scenes() -> list[SceneCase]:
     base = front_scene(12, 0)
     means, logs, quats = (base.params[key] for key in ("means", "log_scales", "quats"))
 
-    # axis u along the ray, v along the camera's y axis where possible: the ray lies in the disc's plane
+    # axis u along the ray, which lies in the disc's plane
     along, side = rays_and_sides(means)
     edge_on = quaternions(torch.stack([along, torch.linalg.cross(side, along), side], dim=-1))
     on_plane, level, some_zero = means.clone(), means.clone(), quats.clone()
@@ -143,7 +143,7 @@ def extreme_scenes() -> list[SceneCase]:
 class Sweep:
     """Scenes along one kind of stiffness, which differ in nothing else."""
 
-    name: str  # short, for tables
+    name: str
     axis: str  # quantity with its unit
     values: tuple[float, ...]  # from easy to hard
     make: Callable[[float], SceneCase]  # builds the scene of a value
@@ -151,7 +151,6 @@ class Sweep:
 
 
 def decades(first: int, last: int) -> tuple[float, ...]:
-    """List the powers of ten from 10^first to 10^last."""
     step = 1 if last > first else -1
     return tuple(10.0**k for k in range(first, last + step, step))
 
@@ -208,18 +207,17 @@ SWEEPS = (
 )
 
 
-RIM = 1e-3  # bound of the kernel's derivative at the rim, `SceneConfig.rim`'s default, in backend and reference
-TEXELS, ALPHAS = "texels", "texel_alpha"  # names of texels and their alphas among the parameters of a case
-TILE = (8, 4)  # sides of a tile of a case, texels along u and v
-ON_A_TEXEL = 1e-6
-"""Distance from a texel's centre, as a share of the tile's side, below which rounding decides the cell."""
+RIM = 1e-3  # `SceneConfig.rim`, in backend and reference
+TEXELS, ALPHAS = "texels", "texel_alpha"  # parameters of a case
+TILE = (8, 4)  # texels of a tile along u and v
+ON_A_TEXEL = 1e-6  # distance from a texel's centre, in tiles, below which rounding decides the cell
 
 
 @dataclass(frozen=True)
 class Way:
     """A rendering mode, measured on the same scenes."""
 
-    name: str  # short, for tables and tests
+    name: str
     texels: bool = False  # each surfel has a tile of random texels
     alpha: bool = False  # the texels have random alphas from 0 to 2, without a weight bound
 
@@ -240,7 +238,6 @@ WAYS = (Way(TEXELS, texels=True), Way("alpha", texels=True, alpha=True))
 
 
 def tiles_of(texels: Tensor) -> TexelTiles:
-    """Build the tiles of texels [T, 3]."""
     n = len(texels) // (TILE[0] * TILE[1])
     size = torch.tensor(TILE, dtype=torch.int32, device=texels.device).expand(n, 2)
     return TexelTiles.of_sizes(size, texels.new_full((n,), float(SUPPORT)))

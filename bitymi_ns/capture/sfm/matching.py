@@ -1,5 +1,6 @@
-"""Extract SIFT features of all photographs into COLMAP's database, choose pairs, and match them."""
+"""Extract SIFT features into COLMAP's database, choose pairs of photographs, and match them."""
 
+import os
 from itertools import combinations
 from pathlib import Path
 
@@ -10,8 +11,10 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.types import SPHERICAL_MODEL
 from bitymi_ns.files import write_file
-from .job import PAIRS, CameraGroup, Job, StageProgress
+from bitymi_ns.progress import Progress
+from .job import PAIRS, CameraGroup, Job
 
+EXTRACTED, MATCHED = 8, 64  # photographs, and pairs, per processor that COLMAP is called for before progress is told
 SMALL = 1000  # pixels; photographs with a shorter longer side are doubled
 SPHERICAL_SCALE = 2
 """Factor on `SMALL` and the largest image size for 360-degree pictures, whose details are small: with half the
@@ -27,10 +30,10 @@ SEQUENCE_NEIGHBOURS = 6
 SEQUENCE_SHARE = 0.8  # least share of consecutive photographs that are among the most alike
 
 
-def extract(job: Job, database: Path, tell: StageProgress) -> None:
+def extract(job: Job, database: Path, tell: Progress) -> None:
     """Extract features of the photographs that have none in the database."""
-    total = len(job.order)
-    tell("finding features", 0, total, counts="keypoints")
+    done, total, at_once = 0, len(job.order), EXTRACTED * (os.cpu_count() or 1)
+    tell("finding features", done, total)
     ids = zip(job.cameras, camera_ids(job, database), strict=True)
     single, groups = {"camera_mode": pycolmap.CameraMode.SINGLE}, []
     for group, camera_id in ids:
@@ -40,9 +43,11 @@ def extract(job: Job, database: Path, tell: StageProgress) -> None:
         pycolmap.import_images(database, job.images, image_names=group.names, options=reader, **single)
     for group, reader in groups:
         options = {"reader_options": reader, "extraction_options": _extraction(job, group), **single}
-        how = {"image_names": group.names, "device": pycolmap.Device.cpu}
-        pycolmap.extract_features(database, job.images, **how, **options)
-    tell("finding features", total, total)
+        for start in range(0, len(group.names), at_once):
+            names = group.names[start : start + at_once]
+            pycolmap.extract_features(database, job.images, image_names=names, device=pycolmap.Device.cpu, **options)
+            done += len(names)
+            tell("finding features", done, total)
 
 
 def camera_ids(job: Job, database: Path) -> list[int]:
@@ -64,23 +69,28 @@ def _extraction(job: Job, group: CameraGroup) -> pycolmap.FeatureExtractionOptio
     return options
 
 
-def match(job: Job, database: Path, tell: StageProgress, every: bool = False) -> None:
+def match(job: Job, database: Path, tell: Progress, every: bool = False) -> None:
     """Choose pairs, or take `every` one, and match those not matched yet."""
     listed = Path(job.work) / PAIRS
     if every or not listed.exists():
         pairs = list(combinations(range(len(job.order)), 2)) if every else choose(job, database, tell)
         write_file(listed, "".join(f"{job.order[i]} {job.order[j]}\n" for i, j in pairs).encode())
-    options = pycolmap.ImportedPairingOptions(match_list_path=listed)
-    total = len(listed.read_text("utf8").splitlines())
-    tell("comparing photographs", 0, total, counts="two_view_geometries")
+    lines = listed.read_text("utf8").splitlines(keepends=True)
+    total, at_once = len(lines), MATCHED * (os.cpu_count() or 1)
+    tell("comparing photographs", 0, total)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    settings = {"pairing_options": options, "verification_options": verification}
-    pycolmap.match_image_pairs(database, **settings, device=pycolmap.Device.cpu)
-    tell("comparing photographs", total, total)
+    settings = {"verification_options": verification, "device": pycolmap.Device.cpu}
+    with job.scratch() as folder:
+        for start in range(0, total, at_once):
+            part = folder / PAIRS
+            part.write_text("".join(lines[start : start + at_once]), "utf8")
+            options = pycolmap.ImportedPairingOptions(match_list_path=part)
+            pycolmap.match_image_pairs(database, pairing_options=options, **settings)
+            tell("comparing photographs", min(start + at_once, total), total)
 
 
-def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int]]:
+def choose(job: Job, database: Path, tell: Progress) -> list[tuple[int, int]]:
     """Choose pairs of indices into `job.order`, the smaller one first."""
     count = len(job.order)
     if job.matching == "exhaustive" or (job.matching == "auto" and count <= FEW):
@@ -97,7 +107,7 @@ def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int
     return sorted(pairs)
 
 
-def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
+def likeness(job: Job, database: Path, tell: Progress) -> np.ndarray:
     """Count the largest features [n,n] that pairs of photographs share; 0 on the diagonal."""
     count = len(job.order)
     size = COARSE_FEATURES[count > MANY]

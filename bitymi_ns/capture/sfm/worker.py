@@ -1,4 +1,4 @@
-"""Run COLMAP in this process: a Job on stdin, lines of JSON on stdout. A line is {"stage", "done", "total", "counts"},
+"""Run COLMAP in this process: a Job on stdin, lines of JSON on stdout. A line is {"stage", "done", "total"},
 or at the end {"result"} or {"failure"}. The process ends with its stdin. Prints of COLMAP and its libraries go to
 stderr."""
 
@@ -30,12 +30,12 @@ class Stages:
         self._stage = "starting"
         self._lock = threading.Lock()
 
-    def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None:
+    def __call__(self, step: str, done: int, total: int) -> None:
         with self._lock:
             now = time.monotonic()
             self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
-            self._stage, self._since = stage, now
-            send(stage=stage, done=done, total=total, counts=counts)
+            self._stage, self._since = step, now
+            send(stage=step, done=done, total=total)
 
 
 def send(**line: object) -> None:

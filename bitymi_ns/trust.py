@@ -3,13 +3,13 @@ control characters, and modules in the current folder."""
 
 import errno
 import json
-import math
 import os
 import re
 import stat
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from itertools import chain
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -175,17 +175,8 @@ def leads_inside(name: str) -> bool:
 
 
 def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    numbers = {}
-    for key, value in values.items():
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            continue
-        try:
-            number = float(value)
-        except OverflowError:  # an integer beyond the range of a double
-            continue
-        if math.isfinite(number):
-            numbers[key] = number
-    return numbers
+    numbers = {key: value for key, value in values.items() if type(value) in (int, float)}
+    return {key: float(value) for key, value in numbers.items() if abs(value) <= sys.float_info.max}
 
 
 def json_of(data: str | bytes) -> Any:
@@ -196,12 +187,8 @@ def json_of(data: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
     level = [value]
     for _ in range(DEEPEST):
-        level = [
-            child
-            for each in level
-            if isinstance(each, (list, dict))
-            for child in (each.values() if isinstance(each, dict) else each)
-        ]
+        parts = (part.values() if isinstance(part, dict) else part for part in level if isinstance(part, (list, dict)))
+        level = list(chain.from_iterable(parts))
         if not level:
             return value
     raise ValueError("it is nested too deeply")
@@ -230,11 +217,7 @@ def listed(names: Sequence[object], most: int = 3) -> str:
 
 def is_text(name: str | os.PathLike[str]) -> bool:
     """Test if a file's name can be encoded as UTF-8."""
-    try:
-        os.fspath(name).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
+    return not re.search("[\ud800-\udfff]", os.fspath(name))
 
 
 def python_command(module: str, function: str) -> list[str]:

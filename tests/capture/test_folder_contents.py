@@ -53,6 +53,7 @@ def photographs(tmp_path: Path) -> Path:
     folder = tmp_path / "walk"
     for name in "abc":
         save(folder / f"{name}.jpg")
+    save(folder / ".hidden/masks/a.jpg")
     for name in RESULTS:
         save(folder / name, **({"comment": RENDERED} if name.startswith("frames/") else {}))
     data = (folder / "frames2/00000.png").read_bytes()
@@ -126,15 +127,11 @@ def test_a_film_of_ours_is_no_video_to_train_on(tmp_path: Path) -> None:
     assert passed_over(tmp_path) == ["film.mp4 (a film of ns-render)"]
 
 
-def test_poses_of_other_programs(tmp_path: Path) -> None:
+def test_what_converts_poses_of_other_programs(tmp_path: Path) -> None:
     (tmp_path / "Cameras.xml").write_text('<document><chunk><cameras><camera id="0"/></cameras></chunk></document>')
-    (tmp_path / "config.xml").write_text("<settings/>")
-    (tmp_path / "poses_bounds.npy").touch()
     (tmp_path / "cameras.npz").mkdir()
-    first, second = poses_in(tmp_path)
     command = f"ns-process-data metashape --data {tmp_path} --xml {tmp_path}/Cameras.xml --output-dir NEW"
-    assert first == f"Cameras.xml (Metashape; `{command}`, which needs the program ffmpeg, converts it)"
-    assert second.startswith("poses_bounds.npy (LLFF; write each as 4 x 4 numbers")
+    assert poses_in(tmp_path) == (f"Cameras.xml (Metashape; `{command}`, which needs the program ffmpeg, converts it)",)
 
 
 def test_raw_data_beside_photographs_do_not_count(tmp_path: Path) -> None:

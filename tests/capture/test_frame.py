@@ -18,6 +18,12 @@ def centers(model: pycolmap.Reconstruction) -> dict[str, np.ndarray]:
     return {image.name: image.projection_center() for image in model.images.values()}
 
 
+def in_metres(model: pycolmap.Reconstruction) -> tuple[float, dict[str, np.ndarray]]:
+    """Scale the cameras to a spread of 40 m."""
+    scale = 40 / np.std(list(centers(model).values()))
+    return scale, {name: scale * place for name, place in centers(model).items()}
+
+
 def to_degrees(place: np.ndarray) -> tuple[float, float, float]:
     """Convert east, north and up in metres to degrees at 48 degrees north."""
     return 48.0 + place[1] / 111_199.5, 11.0 + place[0] / 74_628.4, 500.0 + place[2]
@@ -40,8 +46,7 @@ def test_the_antimeridian_is_crossed(middle: float) -> None:
 def test_gps_gives_metres_and_up() -> None:
     model = synthetic()
     turned = pycolmap.Sim3d(0.05, pycolmap.Rotation3d(np.array([0.3, -1.0, 0.5])), np.array([4.0, 5.0, 6.0]))
-    scale = 40 / np.std(list(centers(model).values()))
-    true = {name: scale * place for name, place in centers(model).items()}
+    _, true = in_metres(model)
     model.transform(turned)
     rng = np.random.default_rng(0)
     places = {name: to_degrees(place + rng.normal(0, 2, 3)) for name, place in true.items()}
@@ -56,8 +61,7 @@ def test_gps_gives_metres_and_up() -> None:
 def test_the_larger_group_of_positions_counts(reported: list[str], tmp_path: Path) -> None:
     """The second half of the photographs is of another flight, 15 m higher."""
     model = synthetic()
-    scale = 40 / np.std(list(centers(model).values()))
-    true = {name: scale * place for name, place in centers(model).items()}
+    scale, true = in_metres(model)
     places = {name: to_degrees(place + (0, 0, 15 * (i >= 6))) for i, (name, place) in enumerate(true.items())}
     frame = move_to_world(model, places)
     assert frame.up == "gps" and frame.gps_error < 0.1
@@ -120,8 +124,7 @@ def test_up_is_what_most_accelerometers_say(wrong: int, source: str) -> None:
 
 def test_gravity_says_what_is_up_and_gps_how_long_a_metre_is() -> None:
     model = synthetic()
-    scale = 40 / np.std(list(centers(model).values()))
-    true = {name: scale * place for name, place in centers(model).items()}
+    scale, true = in_metres(model)
     ups = held(model, np.array(UP))
     rng = np.random.default_rng(0)
     places = {name: to_degrees(place + rng.normal(0, 4, 3)) for name, place in true.items()}

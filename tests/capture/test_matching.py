@@ -59,10 +59,6 @@ def test_reasons_name_what_is_missing() -> None:
     assert "16 matches" in reasons["weak.jpg"]
 
 
-def job_of(places: dict[str, list[float]], order: list[str]) -> Job:
-    return Job("", "", None, [], order, {name: name for name in order}, False, places)
-
-
 def test_photographs_are_compared_with_those_near_them(monkeypatch: pytest.MonkeyPatch) -> None:
     count = 60
     monkeypatch.setattr(matching, "likeness", lambda job, database, tell: np.zeros((count, count), np.float32))
@@ -70,7 +66,8 @@ def test_photographs_are_compared_with_those_near_them(monkeypatch: pytest.Monke
     line = {name: [10.0 * int(name), 0.0, 0.0] for name in order}
 
     def chosen(places: dict[str, list[float]]) -> set[tuple[int, int]]:
-        found = matching.choose(job_of(places, order), Path(), lambda *said: None)
+        job = Job("", "", None, [], order, {name: name for name in order}, False, places)
+        found = matching.choose(job, Path(), lambda *said: None)
         return {(int(order[i]), int(order[j])) for i, j in found}
 
     alone = chosen({})

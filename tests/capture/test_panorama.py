@@ -41,9 +41,7 @@ def photograph(turn: float, height: int = 256) -> np.ndarray:
     return shaded(rays / np.linalg.norm(rays, axis=-1, keepdims=True), (0.0, 0.0, 1.2))
 
 
-@cache
-def room_of_tests() -> Room:
-    return Room(0)
+room_of_tests = cache(lambda: Room(0))
 
 
 def shaded(rays: np.ndarray, centre: tuple[float, float, float]) -> np.ndarray:
@@ -101,16 +99,11 @@ def test_what_metadata_say(tmp_path: Path, suffix: str) -> None:
         data = data[:2] + b"\xff\xe1" + (len(body) + 2).to_bytes(2, "big") + body + data[2:]
     else:
         chunk = b"iTXtXML:com.adobe.xmp\0\0\0\0\0" + XMP
-        data = (
-            data[:33] + (len(chunk) - 4).to_bytes(4, "big") + chunk + zlib.crc32(chunk).to_bytes(4, "big") + data[33:]
-        )
+        size, check = (value.to_bytes(4, "big") for value in (len(chunk) - 4, zlib.crc32(chunk)))
+        data = data[:33] + size + chunk + check + data[33:]
     marked.write_bytes(data)
     Image.open(marked).load()
-    assert (
-        has_panorama_metadata(marked)
-        and not has_panorama_metadata(plain)
-        and not has_panorama_metadata(tmp_path / "none.jpg")
-    )
+    assert [has_panorama_metadata(path) for path in (marked, plain, tmp_path / "none.jpg")] == [True, False, False]
 
 
 @pytest.mark.slow
@@ -133,9 +126,7 @@ def test_those_of_less_than_all_directions_are_refused(tmp_path: Path, monkeypat
     (tmp_path / "walk").mkdir()
     for i in range(4):
         Image.fromarray(panorama(0.3 * i, 64)[:, : 128 - 40]).save(tmp_path / f"walk/{i}.png")
-    with pytest.raises(
-        CaptureError, match="4 of 4 photographs .* are panoramas .* show all directions, twice as wide as high"
-    ):
+    with pytest.raises(CaptureError, match="4 of 4 photographs .* are panoramas .* show all directions"):
         find_poses(tmp_path / "walk", SfmOptions(camera_model="EQUIRECTANGULAR"))
 
 

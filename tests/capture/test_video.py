@@ -11,18 +11,20 @@ from PIL import Image
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.types import CaptureError, SfmOptions
 from bitymi_ns.capture.video import PER_SECOND, _survey, choose, displacement, extract_frames
+from bitymi_ns.progress import no_progress
 
 
-def silent(step: str, done: int, total: int) -> None: ...
-
-
-def write_video(path: Path, frames: list[np.ndarray], rate: int = 10, times: list[int] | None = None) -> None:
-    """Write frames at a constant rate, or at these times in milliseconds; an MP4 with its index first."""
+def write_video(
+    path: Path, frames: list[np.ndarray], rate: int = 10, times: list[int] | None = None, shape: int | Fraction = 1
+) -> None:
+    """Write frames at a constant rate, or at these times in milliseconds, of this pixel aspect ratio; an MP4 with its
+    index first."""
     options = {"movflags": "faststart"} if path.suffix == ".mp4" else {}
     with av.open(str(path), "w", options=options) as container:
         stream = container.add_stream("mpeg4", rate=Fraction(rate))
         stream.height, stream.width = frames[0].shape[:2]
         stream.pix_fmt, stream.bit_rate = "yuv420p", 4_000_000
+        stream.codec_context.sample_aspect_ratio = Fraction(shape)
         if times is not None:
             stream.codec_context.time_base = Fraction(1, 1000)
         for i, frame in enumerate(frames):
@@ -63,14 +65,14 @@ def test_what_is_no_video_is_refused(tmp_path: Path, wide: np.ndarray, data: str
     write_video(tmp_path / "private.mp4", pan(wide, [4] * 6))
     (tmp_path / "a.mp4").write_text(data)
     with pytest.raises(CaptureError, match="a.mp4 cannot be read as a video"):
-        extract_frames(tmp_path / "a.mp4", tmp_path, None, silent)
+        extract_frames(tmp_path / "a.mp4", tmp_path, None, no_progress)
 
 
 def test_a_name_that_begins_like_an_address(tmp_path: Path, wide: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     write_video(tmp_path / "walk.mp4", pan(wide, [16] * 6))
     (tmp_path / "walk.mp4").rename("subfile:walk.mp4")
-    assert len(numbers(extract_frames(Path("subfile:walk.mp4"), tmp_path, 3, silent))) == 3
+    assert len(numbers(extract_frames(Path("subfile:walk.mp4"), tmp_path, 3, no_progress))) == 3
 
 
 def test_the_displacement_is_that_of_the_picture(wide: np.ndarray) -> None:
@@ -83,7 +85,7 @@ def test_the_displacement_is_that_of_the_picture(wide: np.ndarray) -> None:
 def test_frames_are_taken_where_the_camera_moves(tmp_path: Path, wide: np.ndarray) -> None:
     steps = [0] * 20 + [16] * 40 + [0] * 20
     write_video(tmp_path / "a.mp4", pan(wide, steps))
-    taken = numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, silent))
+    taken = numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, no_progress))
     moving = [number for number in taken if 19 <= number <= 61]
     assert 20 <= len(taken) <= 45 and len(moving) >= len(taken) - 2
     assert max(np.diff(moving)) <= 5
@@ -97,9 +99,9 @@ def test_the_sharpest_of_each_stretch_is_taken() -> None:
 
 def test_a_number_of_frames_is_taken_once(tmp_path: Path, wide: np.ndarray) -> None:
     write_video(tmp_path / "a.mp4", pan(wide, [16] * 30))
-    folder = extract_frames(tmp_path / "a.mp4", tmp_path, 10, silent)
+    folder = extract_frames(tmp_path / "a.mp4", tmp_path, 10, no_progress)
     (tmp_path / "a.mp4").unlink()
-    assert len(numbers(folder)) == 10 and extract_frames(tmp_path / "a.mp4", tmp_path, 10, silent) == folder
+    assert len(numbers(folder)) == 10 and extract_frames(tmp_path / "a.mp4", tmp_path, 10, no_progress) == folder
 
 
 def test_frames_of_a_varying_rate_are_looked_at_by_their_times(tmp_path: Path, wide: np.ndarray) -> None:
@@ -110,19 +112,19 @@ def test_frames_of_a_varying_rate_are_looked_at_by_their_times(tmp_path: Path, w
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert float(container.streams.video[0].average_rate) > 30  # every other frame, if that were the rate of all
         assert [round(1000 * frame.time) for frame in container.decode(video=0)] == times
-    seen, _, _ = _survey(tmp_path / "a.mp4", silent)
+    seen, _, _ = _survey(tmp_path / "a.mp4", no_progress)
     assert [number for number in seen if number > still] == list(range(still + 1, len(times)))
     assert 7 <= sum(number <= still for number in seen) <= 11
-    taken = numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, silent))
+    taken = numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, no_progress))
     assert len(taken) >= 20 and sum(number < still for number in taken) <= 1
 
 
 def test_all_frames_of_a_clip_of_a_second_are_looked_at(tmp_path: Path, wide: np.ndarray) -> None:
     write_video(tmp_path / "a.mp4", pan(wide, [25] * 30), rate=30)
-    assert len(numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, silent))) >= 20
+    assert len(numbers(extract_frames(tmp_path / "a.mp4", tmp_path, None, no_progress))) >= 20
     with pytest.raises(CaptureError, match=r"has too few frames \(2\): film for ten"):
         write_video(tmp_path / "b.mp4", pan(wide, [25] * 2), rate=30)
-        extract_frames(tmp_path / "b.mp4", tmp_path / "b", None, silent)
+        extract_frames(tmp_path / "b.mp4", tmp_path / "b", None, no_progress)
 
 
 @pytest.mark.slow
@@ -131,7 +133,7 @@ def test_of_a_longer_video_about_fifteen_frames_per_second_are_looked_at(
     tmp_path: Path, wide: np.ndarray, rate: int
 ) -> None:
     write_video(tmp_path / "a.mp4", pan(wide[:, ::4], [0] * (5 * rate)), rate=rate)
-    seen, _, _ = _survey(tmp_path / "a.mp4", silent)
+    seen, _, _ = _survey(tmp_path / "a.mp4", no_progress)
     assert seen == list(range(0, 5 * rate, round(rate / PER_SECOND)))
 
 
@@ -163,7 +165,7 @@ def test_every_display_matrix_is_applied_or_named(
     header = data.index(b"tkhd")
     stored = data[header:].replace(entries(1, 0, 0, 1), entries(*matrix), 1)
     (tmp_path / "a.mp4").write_bytes(data[:header] + stored)
-    for path in extract_frames(tmp_path / "a.mp4", tmp_path, 4, silent).iterdir():
+    for path in extract_frames(tmp_path / "a.mp4", tmp_path, 4, no_progress).iterdir():
         expected = seen(frames[int(path.stem.split("_")[1])])
         picture = np.asarray(Image.open(path), float)
         assert picture.shape == expected.shape and np.abs(picture - expected).mean() < 12
@@ -182,7 +184,7 @@ def test_a_video_without_motion_is_refused(tmp_path: Path, wide: np.ndarray) -> 
     noisy = (np.clip(still + rng.normal(0, 3, still.shape), 0, 255).astype(np.uint8) for _ in range(30))
     write_video(tmp_path / "a.mp4", list(noisy))
     with pytest.raises(CaptureError, match="shows no motion: .* Film while you walk"):
-        extract_frames(tmp_path / "a.mp4", tmp_path, None, silent)
+        extract_frames(tmp_path / "a.mp4", tmp_path, None, no_progress)
     assert not (tmp_path / "images").exists()
 
 
@@ -193,7 +195,7 @@ def test_an_error_of_the_decoder_without_a_reason_is_told(tmp_path: Path, monkey
     (tmp_path / "film.mp4").write_bytes(b"\0" * 64)
     monkeypatch.setattr(av, "open", refuse)
     with pytest.raises(CaptureError, match="out of range"):
-        extract_frames(tmp_path / "film.mp4", tmp_path, None, silent)
+        extract_frames(tmp_path / "film.mp4", tmp_path, None, no_progress)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +214,7 @@ def test_a_video_that_breaks_off_gives_what_it_has(
     write_video(path, pan(wide, [16] * 40))
     whole = path.read_bytes()
     path.write_bytes(whole[: int(len(whole) * share)])
-    assert len(numbers(extract_frames(path, tmp_path, None, silent))) >= 8
+    assert len(numbers(extract_frames(path, tmp_path, None, no_progress))) >= 8
     assert re.search(line, caplog.text)
 
 
@@ -229,7 +231,7 @@ def test_frames_behind_damage_keep_their_numbers(
     frames = pan(wide, [16] * 40)
     write_video(tmp_path / "a.mp4", frames)  # a key frame every 12
     overwrite_packets(tmp_path / "a.mp4", 15)
-    taken = sorted(extract_frames(tmp_path / "a.mp4", tmp_path, 40, silent).iterdir())
+    taken = sorted(extract_frames(tmp_path / "a.mp4", tmp_path, 40, no_progress).iterdir())
     assert numbers(tmp_path / "images") == [*range(15), *range(24, 40)]
     assert "a.mp4 is damaged: 9 of its 40 frames are left out" in caplog.text
     for path in taken:
@@ -244,8 +246,8 @@ def test_frames_of_any_size_are_surveyed(tmp_path: Path, wide: np.ndarray, sizes
         write_video(tmp_path / f"{i}.ts", [np.asarray(Image.fromarray(frame).resize(size)) for frame in frames])
     parts = sorted(tmp_path.glob("?.ts"))
     (tmp_path / "a.mts").write_bytes(b"".join(part.read_bytes() for part in parts))
-    assert len(_survey(tmp_path / "a.mts", silent)[0]) == 12
-    taken = extract_frames(tmp_path / "a.mts", tmp_path, 12, silent).iterdir()
+    assert len(_survey(tmp_path / "a.mts", no_progress)[0]) == 12
+    taken = extract_frames(tmp_path / "a.mts", tmp_path, 12, no_progress).iterdir()
     assert {Image.open(path).size for path in taken} == {*sizes}
 
 
@@ -274,19 +276,12 @@ def test_a_cover_is_not_the_film(tmp_path: Path, wide: np.ndarray) -> None:
         for frame in pan(wide, [0] + [20] * 20):
             container.mux(film.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
         container.mux(film.encode())
-    folder = extract_frames(path, tmp_path, None, silent)
+    folder = extract_frames(path, tmp_path, None, no_progress)
     assert {Image.open(frame).size for frame in folder.iterdir()} == {(320, 240)}
     assert len(numbers(folder)) > 3
 
 
 def test_pixels_that_are_not_square_are_stretched(tmp_path: Path, wide: np.ndarray) -> None:
-    path = tmp_path / "a.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg4", rate=10)
-        stream.width, stream.height, stream.pix_fmt = 320, 240, "yuv420p"
-        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-        for frame in pan(wide, [0] + [20] * 10):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
-        container.mux(stream.encode())
-    folder = extract_frames(path, tmp_path, 3, silent)
+    write_video(tmp_path / "a.mp4", pan(wide, [0] + [20] * 10), shape=Fraction(4, 3))
+    folder = extract_frames(tmp_path / "a.mp4", tmp_path, 3, no_progress)
     assert {Image.open(frame).size for frame in folder.iterdir()} == {(427, 240)}

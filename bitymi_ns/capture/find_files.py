@@ -150,7 +150,7 @@ def report_renamed(source: str, names: Sequence[str], files: Sequence[Path], fol
     renamed = [f"{file.relative_to(folder).as_posix()} for {name}" for name, file in zip(names, files, strict=True)
                if file.is_relative_to(folder) and not is_usual(name, file)]  # fmt: skip
     if renamed:
-        say(f"{source}: {len(renamed)} of {len(names)} photographs have other names than it says: {listed(renamed)}.")
+        say(f"{source}: {len(renamed)} of {len(names)} photographs have other names: {listed(renamed)}.")
 
 
 def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks: Sequence[Path | None]) -> None:
@@ -160,7 +160,7 @@ def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks:
     pictures = dict.fromkeys(Path(os.path.normpath(file)) for file in (*files, *masks) if file is not None)
     outside = [file for file in pictures if not file.is_relative_to(folder) and os.path.isfile(file)]
     if outside:
-        warn(f"{path} names pictures outside of its folder, which are read there: {listed(outside)}.")
+        warn(f"{path} names pictures outside of its folder: {listed(outside)}.")
 
 
 def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:

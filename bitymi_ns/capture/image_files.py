@@ -172,7 +172,7 @@ _WORDED = (FileNotFoundError, Image.DecompressionBombError)
 def wrong_size(path: Path | None, size: tuple[int, int], declared: tuple[int, int], camera: str = "its camera") -> str:
     shown = f"{size[0]} x {size[1]} pixels, but {camera} is for {declared[0]} x {declared[1]}"
     if size == declared[::-1]:
-        turn = "If an EXIF tag turns it for viewers, turn its pixels: `mogrify -auto-orient <photos>`"
+        turn = "If an EXIF tag turns it, turn its pixels: `mogrify -auto-orient <photos>`"
         return f"the image {path} is turned by a quarter: it has {shown}. {turn}. Else swap w and h, and cx and cy."
     return f"the image {path} has {shown}. Correct w, h, fl_x, fl_y, cx, cy in the capture, or resize the image."
 

@@ -63,7 +63,7 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
         pose[:3] = mirror @ (pose[:3] - np.pad(middle[:, None], ((0, 0), (3, 0))))
         views.append(replace(view, camera=view.camera.rescaled(*stored), pose=pose))
     without = "`bitymi-data --points random`"
-    say(f"{source} has no points: they are triangulated from the photographs, once. {without} does without.")
+    say(f"{source} has no points: they are triangulated, once. {without} does without.")
     try:
         if any(mirrored) and not all(mirrored):
             fail("some poses are mirrored against the others")
@@ -72,7 +72,7 @@ def triangulated(photographs: Sequence[Photograph], folder: Path, source: str) -
     except CaptureError as error:
         warn(f"No points can be triangulated: {error}. Training starts from random points.")
         return None
-    say(f"{len(model.xyz):,} points have been triangulated; they are kept for later runs.")
+    say(f"{len(model.xyz):,} points have been triangulated, and are kept.")
     if len(model.xyz) < FEW_POINTS * len(views):
         warn(f"That is few for {len(views)} photographs, which share little detail: {without} may do better.")
     return Points(model.xyz @ mirror + middle, model.rgb)

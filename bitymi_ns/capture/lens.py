@@ -175,7 +175,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list
     focal = (camera.focal_length_x, camera.focal_length_y)
     if not np.isfinite(params).all() or min(focal) <= 0.0 or min(width, height) < 1:
         what = f"{label} ({model}, {width} x {height}, {camera.params_to_string()}) cannot be used"
-        fail(f"{what}: size and focal lengths have to be positive, all numbers finite. Correct it; leave signs out.")
+        fail(f"{what}: size and focal lengths have to be positive, all numbers finite. Correct it.")
     center = (camera.principal_point_x, camera.principal_point_y)
     lens = Lens(colmap, stored, Pinhole(*focal, *center, width, height))
     if not lens.distorts:
@@ -185,7 +185,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list
     share = w * h / (width * height)
     if share < ABSURD_AREA or min(w, h) < 1:
         what = f"{model} {camera.params_to_string()} would leave {100.0 * share:.2g} % of the picture"
-        fail(f"the lens distortion of {label} is absurd: {what}. Correct it, or calibrate a SIMPLE_RADIAL camera.")
+        fail(f"the lens distortion of {label} is absurd: {what}. Correct it, or calibrate anew.")
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
     wide = max(pinhole.view) > MAX_VIEW_ANGLE - 0.5
     return _faces(colmap, stored) if wide else [replace(lens, pinhole=pinhole)]

@@ -37,7 +37,7 @@ def mask_folder(photographs: Path, data: Path, stated: Path | None = None, downs
     reduced = [masks.with_name(f"{masks.name}_{downscale}") for masks in whole if downscale > 1]
     masks = next(filter(os.path.isdir, (*whole, *reduced)), None)
     if masks is None and stated is not None:
-        fail(f"the folder of masks {stated} does not exist. Give its path, for --masks-path seen from {data}.")
+        fail(f"the folder of masks {stated} does not exist. Correct --masks-path, which is seen from {data}.")
     return masks
 
 
@@ -94,7 +94,7 @@ def checked_mask(path: Path) -> Image.Image:
     """Read a mask as a 1-bit image, True where pixels count. Raises CaptureError: it cannot be read."""
     if not path.exists():
         fail(f"the mask {path} is missing")
-    with parsing(f"the mask {path}", "Replace it, or remove the masks from the capture."), open_picture(path) as image:
+    with parsing(f"the mask {path}", "Replace it, or remove the masks."), open_picture(path) as image:
         return Image.fromarray(mask_pixels(image) ^ _is_dynamic(path))
 
 

@@ -69,24 +69,24 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
     for frame, name in zip(frames, names, strict=True):
         pose = as_matrix(frame["transform_matrix"])
         if pose is None:
-            fail(f"{path}: the transform_matrix of {name} is not 4 x 4 finite numbers. Correct it or remove the frame.")
+            fail(f"{path}: the transform_matrix of {name} is not 4 x 4 finite numbers. Correct it.")
         if pose[3, 3] and not pose[3, :3].any():
             scaled += [name] * bool(abs(pose[3, 3] - 1.0) > 1e-6)  # numpy 2.5 multiplies no list by its own
             pose = pose / pose[3, 3]  # homogeneous
         if np.abs(pose[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-6:
             what = f"the last row of the transform_matrix of {name} is {' '.join(f'{x:g}' for x in pose[3])}"
-            fail(f"{path}: {what}, not 0 0 0 1. If its position stands there, transpose the matrix.")
+            fail(f"{path}: {what}, not 0 0 0 1. If that is its position, transpose it.")
         poses.append(pose)
     if scaled:
-        say(f"{path}: the transform_matrix of {listed(scaled)} is divided by its last number, which is not 1.")
+        say(f"{path}: the transform_matrix of {listed(scaled)} is divided by its last number.")
     matrices = np.stack(poses)
     matrices[:, :3, :3] = rotations(matrices[:, :3, :3], names, str(path))
     first: dict[str, int] = {}
     for i, (frame, pose, name) in enumerate(zip(frames, matrices, map(os.path.normpath, names), strict=True)):
         before = first.setdefault(name, i)
         if not np.allclose(matrices[before], pose, rtol=1e-5, atol=1e-5):
-            twice = f"frames {before} and {i} (counted from 0) are both of {name}, but with different poses"
-            fail(f"{path}: {twice}. Correct the name of one of them or remove it.")
+            twice = f"frames {before} and {i} (counted from 0) are both of {name}, with different poses"
+            fail(f"{path}: {twice}. Correct one or remove it.")
         frame["transform_matrix"] = pose.tolist()
 
 
@@ -105,13 +105,13 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
     few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
     if few.any():
         which = f"{listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames"
-        warn(f"{which} (by the pose's determinant). If the photograph is not mirrored, too, the pose is wrong.")
+        warn(f"{which} by its pose. If the photograph is not mirrored, too, that is wrong.")
 
 
 def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
     """Fail if all cameras [N, 3] are at one place."""
     if not np.ptp(centers, axis=0).any():
-        fail(f"{source}: all cameras are at one place. Depth cannot be learned: photograph from different places.")
+        fail(f"{source}: all cameras are at one place. Photograph from different places.")
 
 
 def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) -> None:
@@ -123,7 +123,7 @@ def check_outliers(centers: npt.NDArray[np.float64], names: Sequence[object]) ->
     apart = apart[apart >= len(order) - max(1, len(order) // 10)]  # more than a tenth is a group of its own
     if len(apart):
         k = apart[0]
-        times = f"{far[k - 1] / near[k - 1]:,.0f} times as far from the middle of the capture as the others"
+        times = f"{far[k - 1] / near[k - 1]:,.0f} times as far from the middle as the others"
         message = f"the camera of {listed([names[i] for i in order[k:]])} is {times}"
         if far[k - 1] >= TOO_FAR * near[k - 1]:
             fail(f"{message}: beside it they are all at one place. Correct the pose or remove the frame.")

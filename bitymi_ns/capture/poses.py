@@ -61,7 +61,7 @@ def find_poses(
             where = below
         masks, _ = find_masks(names, folder, where, options.masks is not None)
         if not masks and where is not None:
-            advice = "give them the photographs' names, as photo.png for photo.jpg, or leave masks out"
+            advice = "name them as the photographs, photo.png for photo.jpg, or leave them out"
             fail(f"no mask in {where} belongs to a photograph: {advice} (--use-masks False)")
     if source.is_dir():
         left = passed_over(source, masks=masks.values())
@@ -157,7 +157,7 @@ def _find(
     seconds["preparing"] = time.monotonic() - started
     result = process.run(job, source, tell)
     left_out |= result.pop("left_out")
-    notes = {name: "blurred: it has much less fine detail than the others" for name in sfm_photos.blurred(photos)}
+    notes = {name: "blurred: much less fine detail than the others" for name in sfm_photos.blurred(photos)}
     notes |= {photo.name: f"focal length in EXIF not used: {photo.exif.doubt}" for photo in photos if photo.exif.doubt}
     seconds |= result.pop("seconds")
     seconds["all"] = time.monotonic() - begun

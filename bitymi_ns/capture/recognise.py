@@ -227,7 +227,7 @@ def _nothing(data: Path, format: str, candidates: list[tuple[Format, Path]]) -> 
         if kind := folder_contents.kind_of(data, (*OTHERS, *UNREAD)):
             return f"{data} is {kind.what}: {kind.use}."
         is_one = "is one photograph" if data.suffix.lower() in PHOTOGRAPHS else "is no file that can be trained on"
-        return f"{data} {is_one}. Give a folder of photographs, a video, a transforms.json, or a capture's folder."
+        return f"{data} {is_one}. Give a folder of photographs, a video, or a capture with poses."
     if not any(data.iterdir()):
         return f"the folder {data} is empty. Give a folder of photographs, a video, or a capture with poses."
     hint, several = "", captures_in(data)

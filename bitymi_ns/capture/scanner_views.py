@@ -166,7 +166,7 @@ def _intrinsics(folder: Path) -> tuple[float, ...]:
              "intrinsic.txt", "camera-intrinsics.txt", "calibration.txt", "../camera-intrinsics.txt")  # fmt: skip
     path = next((folder / name for name in names if (folder / name).is_file()), None)
     if path is None:
-        advice = "Write its matrix there, a row on each line, or compute poses: `bitymi-data --format photographs`."
+        advice = "Write its matrix there, a row per line, or compute poses: `bitymi-data --format photographs`."
         fail(f"{folder} has poses, but no file with the camera ({', '.join(names[:4])}). {advice}")
     with parsing(path, AGAIN):
         rows = [[float(word) for word in line.split()] for line in read_text(path, MOST_POSE).splitlines()]

@@ -49,7 +49,7 @@ def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings
         poses = find_poses(found.path, options, progress, warn, found.folder)
     keep_work_folder(poses.report.parent)
     placed = f"Poses of {poses.registered} of {poses.given} photographs of {found.path}"
-    say(f"{placed}, to {poses.reprojection_error:.2f} pixels; how they were found is in {poses.report}.")
+    say(f"{placed}, to {poses.reprojection_error:.2f} pixels; report: {poses.report}.")
     if by_gps := gps_line(poses.report):
         say(by_gps)
     if poses.doubt:
@@ -95,7 +95,7 @@ def read_kept_poses(folder: Path | None) -> KeptPoses | None:
     if folder is None or not has_kept_poses(folder := Path(folder)):
         return None
     path = folder / ORIGIN
-    which = f"{path}, which says of what the poses of the run were found,"
+    which = f"{path}, which says what the poses are of,"
     with parsing(which, f"Put the folder {folder} back as it was, or train again."):
         return TypeAdapter(KeptPoses).validate_python({**read_json(path), "folder": folder})
 
@@ -112,7 +112,7 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
     if unused:
         warn(
             f"{' and '.join(unused)} {'is' if len(unused) == 1 else 'are'} not used: the run goes on with the poses it "
-            f"was trained with, in {folder}. To have others computed, leave out --load-dir and --load-checkpoint."
+            f"was trained with, in {folder}. Without --load-dir and --load-checkpoint, others are computed."
         )
     return settings or requested
 

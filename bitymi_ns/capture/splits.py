@@ -177,5 +177,5 @@ def warn_of_duplicates(pairs: Sequence[Pair], train: Sequence[Path], held_out: S
     if not pairs or list(train) == list(held_out):
         return
     which = listed([f"{held_out[j]} = {train[i]}" for i, j in pairs])
-    advice = "Figures on them say nothing about new views: remove the duplicates from the capture."
+    advice = "Figures on them say nothing about new views: remove the duplicates."
     warn(f"{len(pairs)} of {len(held_out)} held-out photographs are training photographs, too: {which}. {advice}")

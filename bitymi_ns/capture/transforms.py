@@ -62,7 +62,7 @@ def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_
     """Read a JSON file, check it, make poses rotations, and find its photographs, maps and masks. Raises CaptureError:
     the file cannot be used; names the frame."""
     if not os.path.lexists(path):
-        fail(f"{path} does not exist, which this kind of capture needs. {HOW_TO_GET_ONE}")
+        fail(f"{path} does not exist. {HOW_TO_GET_ONE}")
     with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):
         meta = read_json(path)
         _drop_nulls(meta)
@@ -72,7 +72,7 @@ def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_
         _check_applied(path, meta)
         for key in [key for key in LISTS if key in meta]:
             if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
-                fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it or remove it.")
+                fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it.")
         correct_poses(path, meta["frames"])
     frames = meta["frames"]
     lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
@@ -83,7 +83,7 @@ def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_
     maps = find_files.find_maps(path, frames, need_photos)
     cloud = meta.get("ply_file_path")
     if cloud is not None and (not isinstance(cloud, str) or not cloud):
-        fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it or remove it.")
+        fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it.")
     if cloud and not os.path.isfile(path.parent / cloud):
         there = find_files.FileFinder(path.parent, extensions=(".ply",)).find(cloud)
         meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
@@ -136,12 +136,12 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
     """Fail if there are no frames, or one lacks an entry or names no file."""
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if isinstance(frames, dict):
-        fail(f"{path}: frames is an object with names, not a list. Write its values as a list, in brackets.")
+        fail(f"{path}: frames is an object, not a list. Write its values as a list, in brackets.")
     if not isinstance(frames, list) or not frames:
-        advice = HOW_TO_GET_ONE if own_format else "Each file of this format needs some: move a few frames there."
+        advice = HOW_TO_GET_ONE if own_format else "Move a few frames there."
         fail(f"{path} lists no frames: the capture has no images with poses. {advice}")
     if own_format and len(frames) < 2:
-        fail(f"{path} has one image only. A scene cannot be learned from one view: take photographs from more sides.")
+        fail(f"{path} has one image only. A scene needs photographs from more sides.")
     for i, frame in enumerate(frames):
         there = frame.keys() if isinstance(frame, dict) else ()
         lacking = [key for key in ("file_path", "transform_matrix") if key not in there]
@@ -156,7 +156,7 @@ def _check_frames(path: Path, meta: Any, own_format: bool) -> None:
                 frame[key] = name.replace("\\", "/")
     without = [frame["file_path"] for frame in frames if "mask_path" not in frame]
     if 0 < len(without) < len(frames):
-        advice = "Give every frame a mask (a white picture lets all pixels count), or none."
+        advice = "Give every frame a mask (white where all counts), or none."
         fail(f"{path}: no mask_path for {listed(without)}, but other frames have one. {advice}")
 
 
@@ -167,7 +167,7 @@ def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
     except (TypeError, ValueError, OverflowError):
         fail(f"{path}: {key} {label} is {value!r}, which is no number")
     if key.endswith("_scale") and not 0.0 < number < math.inf:
-        fail(f"{path}: {key} is {value!r}, which is no positive number. Correct it or remove it.")
+        fail(f"{path}: {key} is {value!r}, which is no positive number. Correct it.")
     if key not in ("w", "h"):
         return number  # what is not finite is refused with the cameras
     if not number.is_integer() or not 1 <= number <= MAX_SIDE:
@@ -181,7 +181,7 @@ def _check_applied(path: Path, meta: dict[str, Any]) -> None:
         transform = as_matrix(meta["applied_transform"])
         if transform is None or abs(np.linalg.det(transform[:3, :3])) < 1e-12:
             fault = "is not a matrix of 3 x 4 finite numbers that can be undone"
-            fail(f"{path}: applied_transform {fault}. Correct it, or remove it: then exports are in this file's frame.")
+            fail(f"{path}: applied_transform {fault}. Correct it, or remove it to export in this file's frame.")
         meta["applied_transform"] = transform
     if "applied_scale" in meta:
         meta["applied_scale"] = check_number(path, "applied_scale", meta["applied_scale"], "for all frames")
@@ -213,7 +213,7 @@ def _camera(path: Path, meta: dict[str, Any], frame: dict[str, Any], file: Path)
               for entry, side in zip(stated, (width, height), strict=True))  # fmt: skip
     fx, fy = (fy if fx is None else fx), (fx if fy is None else fy)
     if fx is None or fy is None:
-        where = "neither fl_x nor camera_angle_x (radians) is in the frame or at the top of the file"
+        where = "neither fl_x nor camera_angle_x (radians) is in the frame or the file"
         fail(f"{path} gives no focal length of {name}: {where}. Add one of them.")
     model, coefficients = _distortion(path, meta, frame)
     return ColmapCamera(model, int(width), int(height), (fx, fy, *middle, *coefficients))

@@ -32,7 +32,7 @@ TRUSTED = {
 }
 """FFmpeg options: a file of any name may be a list of files and URLs to read."""
 LEAST_SURVEYED = 60  # all of a clip of a second or two
-NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene, with it in view"
+NO_MOTION = "shows no motion: its frames are all alike. Film while you walk slowly round the scene"
 PQ, HLG = 16, 18  # transfer functions of high dynamic range (ITU-T H.273)
 BT2020 = 9  # matrix of luma and chroma of such films
 WHITE = 203.0  # cd/m^2 of white paper (ITU-R BT.2408), which becomes a screen's white
@@ -50,8 +50,8 @@ def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -
     def extract(work: Path) -> None:
         total = _pace(video)[2]
         if abs(total - poses) > max(2, poses // 100):
-            what = f"{video} has {total} frames, but {poses} poses: which belong together is unknown"
-            fail(f"{what}. Export the capture again, or have poses computed: `bitymi-data --data {video}`")
+            advice = f"Export the capture again, or compute poses: `bitymi-data --data {video}`"
+            fail(f"{video} has {total} frames, but {poses} poses. {advice}")
         extract_frames(video, work, None, progress, upright=False)
 
     return made_once(video.parent, content_key([(video.name, video)], "frames"), "frames", tell, extract) / IMAGES

@@ -24,7 +24,7 @@ PAIRS_TRIED = 60
 TELLING = 30  # fewest matches of a pair that tell a rotation from a translation
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)  # unknown focal lengths, in longer sides
 
-SHOOT = "Walk round it and take photographs of which each shares at least two thirds with the one before"
+SHOOT = "Walk round it, and let each photograph share at least two thirds with the one before"
 FROM_ONE_SPOT = "the photographs were taken from one spot, which tells nothing of depth. Step sideways between them"
 
 
@@ -69,9 +69,9 @@ def left_out(graph: ViewGraph, placed: set[str], title: dict[str, str]) -> dict[
         if count < FEW_FEATURES:
             why = f"hardly any detail in it: {count} features (blurred, dark, or a bare surface)"
         elif not best[name]:
-            why = "no other photograph shows the same: take some between it and the others"
+            why = "no other photograph shows the same: take some in between"
         elif not with_placed[name]:
-            why = "it overlaps only with photographs that were left out as well: take some between them and the others"
+            why = "it overlaps only with others that were left out as well: take some in between"
         else:
             why = f"too little in common with the others: {with_placed[name]} matches with the most similar one"
         reasons[title[name]] = why

@@ -64,12 +64,12 @@ def _why_ended(work: Path, source: Path, code: int) -> str:
     signs = ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
     full = any(sign in log for sign in signs)
     if full or free < LITTLE_SPACE:
-        full_disk = f"the disk or the quota is full ({size_text(free)} free on the disk)"
+        full_disk = f"disk or quota is full ({size_text(free)} free)"
         return f"{work} cannot be written: {full_disk}. Free some space, and start again: what is done is kept"
     if "database disk image is malformed" in log:
         delete_work(work)
-        return f"what was kept of an earlier run in {work} was damaged and has been removed: start again"
+        return f"{work} was damaged, and has been emptied: start again"
     if code in (-9, 137):
         killed = f"the finding of poses of {source} was killed: the machine may have run out of memory"
-        return f"{killed}. Start it again, it goes on where it stopped; a smaller max_image_size needs less"
+        return f"{killed}. Start again, it goes on; a smaller max_image_size needs less"
     return f"COLMAP failed on {source}: {last or f'it ended with status {code}'}. All it said is in {work / LOG}"

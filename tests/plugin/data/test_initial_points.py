@@ -62,7 +62,7 @@ def test_points_are_triangulated_once(
     assert len(there) > 30 and ((there > [-3.1, -2.6, -0.1]) & (there < [3.1, 2.6, 2.7])).all(1).mean() > 0.8
     assert outputs.metadata["points3D_rgb"].float().std() > 10
     text = printed(capsys)
-    assert "has no points: they are triangulated from the photographs, once" in text and "splatfacto" not in text
+    assert "has no points: they are triangulated, once" in text and "splatfacto" not in text
     assert list((capture / ".bitymi").glob("points-*/points"))
 
 

@@ -107,7 +107,7 @@ NAMES = {
     "drive": lambda name: "C:\\Users\\somebody\\" + name.replace("/", "\\"),
     "unicode": lambda name: unicodedata.normalize("NFD", name),
 }
-OTHER_NAMES = "12 of 12 photographs have other names than it says"
+OTHER_NAMES = "12 of 12 photographs have other names"
 SAME: list[tuple[Form, str, Change, str]] = [
     *((form, "", names(change), "" if what in ("backslashes", "no ending") else OTHER_NAMES)
       for form in PHOTOGRAPHS for what, change in NAMES.items()),
@@ -119,7 +119,7 @@ SAME: list[tuple[Form, str, Change, str]] = [
     (nerfstudio, "", nulls, ""),
     (nerfstudio, "", camera_matrices, ""),
     (nerfstudio, "", matrices(lambda pose: pose[:3]), ""),
-    (nerfstudio, "", matrices(lambda pose: pose / 8), "is divided by its last number, which is not 1"),
+    (nerfstudio, "", matrices(lambda pose: pose / 8), "is divided by its last number"),
     (instant_ngp, "", entries(latlong=False, is_fisheye=False), ""),
     (instant_ngp, "", scaled(0.4), "scaled by 0.4"),
     (blender, "", scaled(2.5), "scaled by 2.5"),
@@ -160,7 +160,7 @@ UNIT = "The point cloud seems to be in another unit than the poses: half of the 
 SAID: list[tuple[Form, str, Change, str]] = [
     *((form, "", entry(lambda meta: (meta.update(fisheye_crop_radius=12.0), meta["frames"][2].update(rotation=0.1))),
        "that are not used: fisheye_crop_radius.") for form in JSON),
-    *((form, "", elsewhere, "names pictures outside of its folder, which are read there: ") for form in JSON),
+    *((form, "", elsewhere, "names pictures outside of its folder: ") for form in JSON),
     (nerfstudio, "", entries(fl_x=4.2), "is 4.2 pixels (fl_x): 48 pixels of the picture span 160 deg"),
     (nerfstudio, "", entry(lambda meta: meta.update(frames=meta["frames"][:5])), "Only 4 training views"),
     (nerfstudio, "", pose(lambda part: part * [-1, 1, 1]), "frame_00004.png is mirrored against the other frames"),

@@ -23,8 +23,8 @@ MOST_TEXT = 1 << 30  # most bytes of JSON or text; 100,000 photographs need a te
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file for reading, also through a link; others are refused before they are opened, as opening a
-    pipe blocks. Raises OSError, whose `strerror` says why."""
+    """Open a regular file for reading, also through a link; opening a pipe would block. Raises OSError, `strerror` says
+    why."""
     try:
         found = os.stat(path)
     except ValueError:  # a null character
@@ -99,8 +99,8 @@ def reading(
     passing: tuple[type[BaseException], ...] = (),
 ) -> Iterator[None]:
     """Convert any exception in the block, which reads untrusted data, to a one-line message of place and cause. `what`:
-    file and entry being read, as in "a.json: frame 3". `refuse`: makes the exception from the message. `advice`: end of
-    the message: what to do, unless memory ran out. `passing`: exceptions that are passed on."""
+    file and entry, as in "a.json: frame 3". `refuse`: makes the exception from the message. `advice`: what to do,
+    unless memory ran out. `passing`: exceptions that are passed on."""
     try:
         yield
     except passing:

@@ -1,5 +1,4 @@
-"""Protection against untrusted files: links, folders writable by others, names that leave their folder, deep JSON,
-control characters, and modules in the current folder."""
+"""Protection against untrusted files, names and JSON, and against modules in the current folder."""
 
 import errno
 import json
@@ -34,22 +33,13 @@ def no_links(name: str | os.PathLike[str], flags: int) -> int:
     """Open or create a file for writing, as an opener for `open`. Raises Refused: it is a symbolic or hard link, is no
     regular file, or belongs neither to the user nor to the folder's owner."""
     path = Path(name)
-    empty = flags & os.O_TRUNC
-    flags = (flags | os.O_NOFOLLOW) & ~(os.O_CREAT | os.O_EXCL | os.O_TRUNC)
-    while True:
-        try:
-            return os.open(path, flags | os.O_CREAT | os.O_EXCL, 0o666)
-        except FileExistsError:
-            pass
-        try:
-            file = os.open(path, flags | os.O_NONBLOCK)  # does not block on a pipe
-            break
-        except FileNotFoundError:  # removed in the meantime
-            continue
-        except OSError as error:
-            if path.is_symlink():
-                raise Refused(f"{path} is a link, which is not followed: remove it", path) from error
-            raise
+    how = (flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK) & ~(os.O_EXCL | os.O_TRUNC)
+    try:
+        file = os.open(path, how, 0o666)  # does not block on a pipe
+    except OSError as error:
+        if path.is_symlink():
+            raise Refused(f"{path} is a link, which is not followed: remove it", path) from error
+        raise
     try:
         found = os.fstat(file)
         if not stat.S_ISREG(found.st_mode):
@@ -58,7 +48,7 @@ def no_links(name: str | os.PathLike[str], flags: int) -> int:
             raise Refused(f"{path} is also the file of another name (a hard link): remove it", path)
         _check_owner(path, found)
         os.set_blocking(file, True)
-        if empty:
+        if flags & os.O_TRUNC:
             os.ftruncate(file, 0)
     except BaseException:
         os.close(file)
@@ -85,9 +75,9 @@ def is_left(folder: Path) -> bool:
 
 
 def own_folder(folder: Path, close: bool = False) -> None:
-    """Create a folder, if missing, that only the user can write to; its parent is not checked. `close`: remove the
-    write permission of others from an existing folder, whose contents do not matter. Raises Refused: it is another
-    user's, others can write to it, or it is a link."""
+    """Create a folder, if missing, that only the user can write to; its parent is not checked. `close`: take write
+    permission from others, as the contents do not matter. Raises Refused: it is another user's, others can write to it,
+    or it is a link."""
     with suppress(FileExistsError):
         folder.mkdir(mode=0o755)
         close = True  # an ACL of the parent may have granted more rights
@@ -223,6 +213,5 @@ def is_text(name: str | os.PathLike[str]) -> bool:
 def python_command(module: str, function: str) -> list[str]:
     """Build a command that calls a function in a new process of this Python; the function returns the exit status, and
     further words of the command are in `sys.argv`. The current folder, which may be an untrusted capture, is removed
-    from the search path: with `-m` or `-c` alone a `json.py` in it would be run. `-P` is missing in Python 3.10; `-I`
-    would also hide the user's own packages."""
+    from the search path (as by `-P`, which Python 3.10 lacks)."""
     return [sys.executable, "-c", _CALL.format(module, function)]

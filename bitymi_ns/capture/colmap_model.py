@@ -1,5 +1,4 @@
-"""Read COLMAP models and check every entry: pycolmap accepts truncated files, ends names in text at the first space,
-and reads no model without points."""
+"""Read COLMAP models. pycolmap accepts truncated files, ends names at the first space, and needs points."""
 
 import errno
 import functools
@@ -73,8 +72,8 @@ def read_model(folder: Path) -> Model:
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in binary form and read it back, as COLMAP ignores failed writes, and does not end reading some
-    truncated files. Raises OSError: a file is incomplete."""
+    """Write a model in binary form, and read it back: COLMAP ignores failed writes. Raises OSError: a file is
+    incomplete."""
     try:
         model.write_binary(folder)
         for name, read in BINARY.items():

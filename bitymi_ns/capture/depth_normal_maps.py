@@ -50,8 +50,8 @@ def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
 
 
 def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
-    """Find maps by the photographs' names in `depth` and `confidence` beside their folder (Polycam, Record3D, ScanNet).
-    Warn of a folder of color pictures, which is not used."""
+    """Find maps of a scanner's photographs beside their folder; warn of a folder of color pictures, which is not
+    used."""
     maps = [maps_called(path.parent.parent, f"depth/{path.stem}", f"confidence/{path.stem}") for path in photographs]
     depths = [files.depth for files in maps if files.depth is not None]
     if depths and all(_is_color(depths[i]) for i in spread(len(depths), COLOR_SAMPLES)):
@@ -93,8 +93,8 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
 
 def read_normal(files: MapFiles, lens: Lens) -> Values:
     """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown. Files hold
-    them in the camera's OpenGL axes, as floats, or as colors (n + 1) / 2 with black for unknown. Raises CaptureError:
-    see `read_depth`."""
+    them in the camera's OpenGL axes, as floats, or as colors (n + 1) / 2 with black for unknown. Raises
+    CaptureError."""
     assert files.normal is not None
     stored = _read(files.normal, lens.stored)
     if stored.ndim != 3 or stored.shape[2] < 3:
@@ -110,8 +110,7 @@ _WITHOUT = "Write it again, or train without: `bitymi-data --depth off`."
 
 
 def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.NDArray[Any]:
-    """Read an array [H, W] or [H, W, C] of RGB order, after a check of its size, if `alike` also of its aspect
-    ratio."""
+    """Read an array [H, W] or [H, W, C] of RGB order; check its size before, if `alike` also its aspect ratio."""
 
     def check(shape: tuple[int, ...]) -> None:
         if len(shape) not in (2, 3) or min(shape) < 1:

@@ -35,8 +35,8 @@ def without_extension(parts: Parts) -> Parts:
 
 @dataclass
 class FileFinder:
-    """Finder of files below a folder: by the exact name, else by the only one with other separators, case, Unicode form
-    or leading folders, else with another extension or none."""
+    """Finder of files: by the exact name, else by the only one that differs in what `folded` removes or in leading
+    folders, else also in the extension."""
 
     folder: Path  # to which names are relative
     outside: bool = False  # allow names that lead out of it

@@ -61,8 +61,7 @@ def gps_line(folder: Path) -> str:
 def local_positions(
     gps: Mapping[str, tuple[float, float, float]],
 ) -> tuple[dict[str, list[float]], tuple[float, float, float] | None]:
-    """Convert GPS positions (degrees, metres) to east, north and up in metres at their middle, which is returned,
-    too."""
+    """Convert GPS positions (degrees, metres) to east, north and up in metres at their middle; also return that."""
     if not gps:
         return {}, None
     values = np.array(list(gps.values()))
@@ -123,8 +122,8 @@ def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, f
 
 
 def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d, np.ndarray] | None:
-    """Align centers [n, 3] with positions [n, 3] in metres, and mark those that agree [n]; None if these are too few,
-    too close together, on one line, or of another shape."""
+    """Align centers [n, 3] with positions [n, 3] in metres, and mark those that agree [n]; None = they determine
+    nothing."""
     if len(positions) < 3:
         return None
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))

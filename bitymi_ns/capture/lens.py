@@ -122,8 +122,7 @@ class Lens:
         return Image.fromarray(pixels.astype(bool) & self.coverage)
 
     def undistort_map(self, values: npt.NDArray[Any], path: Path | None) -> npt.NDArray[Any]:
-        """Undistort uint8 or float32 values [H, W] or [H, W, C] of the photograph's aspect ratio by nearest neighbors;
-        `path` is for messages."""
+        """Undistort uint8 or float32 values [H, W] or [H, W, C], of any size in proportion, by nearest neighbors."""
         size = (values.shape[1], values.shape[0])
         if not in_proportion(size, self.stored):
             fail(wrong_size(path, size, self.stored))

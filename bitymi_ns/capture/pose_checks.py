@@ -20,14 +20,13 @@ TOO_FAR = 1000.0  # relative distance that shrinks the other cameras to one poin
 FAR_FROM_ORIGIN = 100.0  # relative distance from the origin at which float32 blurs cameras
 OTHER_UNIT = 150.0  # ratio of distances, or of picture and cloud, that tells another unit
 USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
-"""Median distance of cameras from their middle in half sides of the scene box: NeRF-Synthetic's, and the largest in the
-format's unit."""
+"""Median distance of cameras from their middle in half sides of the scene box: NeRF-Synthetic's, and the largest."""
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
     """Recover rotations, also mirrored, from the 3 x 3 parts [N, 3, 3] of poses: divide out each matrix's factor, and
-    undo rounding by the nearest rotation; valid ones stay equal. `names` and `source` are for messages. Raises
-    CaptureError: a matrix is not finite, zero or sheared."""
+    undo rounding by the nearest rotation; valid ones stay equal. Raises CaptureError: a matrix is not finite, zero or
+    sheared."""
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
     largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares may overflow

@@ -97,8 +97,7 @@ class CaptureOptions(SplitOptions, FrameOptions):
     colmap_path: Path | None = None  # Folder of the COLMAP model, relative to --data; None = find it.
     ply_path: Path | None = None  # PLY file of points to start from, relative to --data; None = see --points.
     points: Choice = "auto"
-    """Points to start from: those of the capture, else triangulated ones (auto); triangulated ones in any case; or
-    random ones."""
+    """Points to start from: those of the capture, else triangulated ones (auto); triangulated; or random ones."""
     sfm: SfmSettings = SfmSettings()  # noqa: RUF009 - it is frozen
     """Structure from motion for photographs and videos."""
     poses_as: str = AUTO

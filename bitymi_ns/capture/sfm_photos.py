@@ -1,5 +1,5 @@
-"""Photographs for structure from motion: find and read them. 360-degree pictures are told by metadata or content:
-phones take other photographs with an aspect ratio of 2."""
+"""Photographs for structure from motion. 360-degree pictures are told by metadata or content, as others have that
+shape, too."""
 
 import os
 import re

@@ -38,8 +38,8 @@ class KeptPoses(NamedTuple):
 
 
 def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings, use_masks: bool = True) -> Source:
-    """Find poses of photographs or a video, or those of an earlier run. `masks_path` is relative to the capture, None =
-    find it. Raises CaptureError: see `find_poses`."""
+    """Find poses of photographs or a video. `masks_path` is relative to the capture. Raises CaptureError: see
+    `find_poses`."""
     from bitymi_ns.progress import rich_progress
     from .poses import find_poses  # slow to import
 

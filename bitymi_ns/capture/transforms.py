@@ -1,5 +1,4 @@
-"""Read transforms.json of nerfstudio, instant-ngp and Blender. Each entry is read from the frame first, then from the
-top of the file."""
+"""Read transforms.json of nerfstudio, instant-ngp and Blender. Entries of a frame go before those of the file."""
 
 import math
 import os
@@ -59,8 +58,7 @@ class Transforms:
 
 
 def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_masks: bool = True) -> Transforms:
-    """Read a JSON file, check it, make poses rotations, and find its photographs, maps and masks. Raises CaptureError:
-    the file cannot be used; names the frame."""
+    """Read a JSON file, make poses rotations, and find its photographs, maps and masks. Raises CaptureError."""
     if not os.path.lexists(path):
         fail(f"{path} does not exist. {HOW_TO_GET_ONE}")
     with parsing(path, HOW_TO_CORRECT if path.is_file() else HOW_TO_GET_ONE):

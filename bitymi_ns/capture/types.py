@@ -21,8 +21,7 @@ ASPECT = 0.01  # relative tolerance of the aspect ratio 2 of 360-degree pictures
 Orientation = Literal["pca", "up", "vertical", "none"]
 
 CONTRADICTED = 0.1
-"""Share of contradicted matches that makes poses doubtful: right poses of two real captures have 0.012 to 0.016, wrong
-ones of a room with a box of equal faces 0.20 and 0.27."""
+"""Share of contradicted matches that makes poses doubtful: right ones have 0.012 to 0.016, wrong ones 0.20 and 0.27."""
 
 
 class CaptureError(ValueError):

@@ -44,8 +44,8 @@ TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0
 
 
 def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -> Path:
-    """Write the frames of a video with `poses` known poses beside it, as they are stored; see `extract_frames`. Raises
-    CaptureError: it has another number of frames."""
+    """Write the frames of a video with `poses` known poses beside it, as stored. Raises CaptureError: their numbers
+    differ."""
 
     def extract(work: Path) -> None:
         total = _pace(video)[2]

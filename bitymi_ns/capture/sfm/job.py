@@ -37,8 +37,7 @@ class Job:
 
     work: str  # folder for the database and the model
     images: str
-    """Folder of the photographs, or of links to them, under names without spaces, which separate entries of COLMAP's
-    lists."""
+    """Folder of the photographs, or of links to them, under names without spaces, which COLMAP's lists cannot have."""
     masks: str | None  # folder of masks by COLMAP's names, of the size of the photographs
     cameras: list[CameraGroup]
     order: list[str]  # all photographs by time or name
@@ -55,8 +54,7 @@ class Job:
 
     @property
     def threads(self) -> int:
-        """Threads for mapping and triangulation; -1 = all. Several sum in varying order: poses differ by rounding,
-        which grows."""
+        """Threads for mapping and triangulation; -1 = all. Several sum in varying order, and poses differ."""
         return 1 if len(self.order) <= SERIAL else -1
 
     @property

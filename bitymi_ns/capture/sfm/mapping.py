@@ -3,6 +3,7 @@
 import copy
 import shutil
 from collections.abc import Callable
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -77,13 +78,10 @@ def _global(job: Job, database: Path, folder: Path, tell: Progress) -> dict[int,
 
 def _incremental(job: Job, database: Path, folder: Path, tell: Progress) -> dict[int, pycolmap.Reconstruction]:
     stage = "placing one camera after the other"
-    placed = 0
-    total = len(job.order)
+    placed, total = count(1), len(job.order)
 
     def one_more() -> None:
-        nonlocal placed
-        placed += 1
-        tell(stage, min(placed, total), total)
+        tell(stage, min(next(placed), total), total)
 
     tell(stage, 0, total)
     options = pycolmap.IncrementalPipelineOptions(random_seed=0, num_threads=job.threads)

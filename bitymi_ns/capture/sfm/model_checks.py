@@ -18,8 +18,7 @@ FEW_FEATURES = 60  # features of a photograph with hardly any detail
 PARALLAX = 1.0  # largest parallax (`parallax`) of photographs from one spot, degrees
 ROTATED = 2.0  # error up to which a rotation explains a match, in pixels of the images with features
 MOST = 0.9
-"""Least share of a pair's matches, and of the pairs, that a rotation explains if the camera only turned; fewer if it
-moved before a far background."""
+"""Least share of a pair's matches, and of the pairs, that a rotation explains if the camera only turned."""
 PAIRS_TRIED = 60
 TELLING = 30  # fewest matches of a pair that tell a rotation from a translation
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)  # unknown focal lengths, in longer sides

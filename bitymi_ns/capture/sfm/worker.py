@@ -1,6 +1,5 @@
-"""Run COLMAP in this process: a Job on stdin, lines of JSON on stdout. A line is {"stage", "done", "total"},
-or at the end {"result"} or {"failure"}. The process ends with its stdin. Prints of COLMAP and its libraries go to
-stderr."""
+"""Run COLMAP in this process: a Job on stdin, lines of JSON on stdout, {"stage", "done", "total"}, or at the end
+{"result"} or {"failure"}. The process ends with its stdin. Prints of libraries go to stderr."""
 
 import json
 import os

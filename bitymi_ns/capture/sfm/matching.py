@@ -14,7 +14,7 @@ from bitymi_ns.files import write_file
 from bitymi_ns.progress import Progress
 from .job import PAIRS, CameraGroup, Job
 
-EXTRACTED, MATCHED = 8, 64  # photographs, and pairs, per processor that COLMAP is called for before progress is told
+AT_ONCE = 8  # photographs per processor of which features are found before progress is told
 SMALL = 1000  # pixels; photographs with a shorter longer side are doubled
 SPHERICAL_SCALE = 2
 """Factor on `SMALL` and the largest image size for 360-degree pictures, whose details are small: with half the
@@ -32,7 +32,7 @@ SEQUENCE_SHARE = 0.8  # least share of consecutive photographs that are among th
 
 def extract(job: Job, database: Path, tell: Progress) -> None:
     """Extract features of the photographs that have none in the database."""
-    done, total, at_once = 0, len(job.order), EXTRACTED * (os.cpu_count() or 1)
+    done, total, at_once = 0, len(job.order), AT_ONCE * (os.cpu_count() or 1)
     tell("finding features", done, total)
     ids = zip(job.cameras, camera_ids(job, database), strict=True)
     single, groups = {"camera_mode": pycolmap.CameraMode.SINGLE}, []
@@ -75,19 +75,14 @@ def match(job: Job, database: Path, tell: Progress, every: bool = False) -> None
     if every or not listed.exists():
         pairs = list(combinations(range(len(job.order)), 2)) if every else choose(job, database, tell)
         write_file(listed, "".join(f"{job.order[i]} {job.order[j]}\n" for i, j in pairs).encode())
-    lines = listed.read_text("utf8").splitlines(keepends=True)
-    total, at_once = len(lines), MATCHED * (os.cpu_count() or 1)
+    options = pycolmap.ImportedPairingOptions(match_list_path=listed)
+    total = len(listed.read_text("utf8").splitlines())
     tell("comparing photographs", 0, total)
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    settings = {"verification_options": verification, "device": pycolmap.Device.cpu}
-    with job.scratch() as folder:
-        for start in range(0, total, at_once):
-            part = folder / PAIRS
-            part.write_text("".join(lines[start : start + at_once]), "utf8")
-            options = pycolmap.ImportedPairingOptions(match_list_path=part)
-            pycolmap.match_image_pairs(database, pairing_options=options, **settings)
-            tell("comparing photographs", min(start + at_once, total), total)
+    settings = {"pairing_options": options, "verification_options": verification}
+    pycolmap.match_image_pairs(database, **settings, device=pycolmap.Device.cpu)  # in one call, for equal results
+    tell("comparing photographs", total, total)
 
 
 def choose(job: Job, database: Path, tell: Progress) -> list[tuple[int, int]]:

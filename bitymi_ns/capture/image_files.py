@@ -127,26 +127,21 @@ def to_bytes(values: npt.NDArray[np.float64], whites: Sequence[float], what: str
 def in_srgb(image: Image.Image) -> Image.Image:
     """Convert an image with a color profile to sRGB."""
     profile = image.info.get("icc_profile")
-    convert = _to_srgb(profile) if profile and image.mode in ("RGB", "RGBA") else None
-    if convert is None:
-        return image
-    converted = convert.apply(image.convert("RGB"))
-    if image.mode == "RGBA":
-        converted.putalpha(image.getchannel("A"))
-    return converted
+    convert = _to_srgb(profile, image.mode) if profile and image.mode in ("RGB", "RGBA") else None
+    return image if convert is None else convert.apply(image)
 
 
 @lru_cache(maxsize=8)
-def _to_srgb(profile: bytes) -> ImageCms.ImageCmsTransform | None:
-    """Make the transform of an RGB profile to sRGB; None = none, or hardly a change."""
+def _to_srgb(profile: bytes, mode: str) -> ImageCms.ImageCmsTransform | None:
+    """Make the transform of a profile to sRGB for a mode; None = none, or hardly a change."""
     try:
         source = ImageCms.ImageCmsProfile(BytesIO(profile))
-        convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), "RGB", "RGB")
+        convert = ImageCms.buildTransform(source, ImageCms.createProfile("sRGB"), mode, mode)
     except (ImageCms.PyCMSError, OSError):
         return None
     levels = np.array([0, 64, 128, 192, 255], np.uint8)
     probe = np.stack(np.meshgrid(levels, levels, levels), -1).reshape(5, 25, 3)
-    changed = np.asarray(convert.apply(Image.fromarray(probe)), int)
+    changed = np.asarray(convert.apply(Image.fromarray(probe).convert(mode)), int)[..., :3]
     return convert if np.abs(changed - probe).max() > 4 else None
 
 

@@ -26,8 +26,8 @@ GREY = 128
 STEP = 0.1  # of the distance from a camera
 MOST_COMPARED = 1_000_000  # points of a cloud
 SAME = 0.5
-"""Least share of triangulated points on the surfaces of a cloud that is used: right ones have 0.6, others at most
-0.4."""
+"""Least share of triangulated points on the surfaces of a cloud that is used: at least 0.6 of right ones, else 0.4 at
+most."""
 
 
 class Points(NamedTuple):

@@ -37,8 +37,8 @@ INTRINSICS = {f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2
 ENOUGH = 100  # matches that decide
 FITS = 0.5  # least share of matches that poses explain, relative to the pairs' own poses
 LEAD = 2.0
-"""Least ratio of what a reading explains to what poses do as written: 0.26 at most if they are right, else 3.9 at
-least."""
+"""Least ratio of what a reading explains to what poses explain as written: at most 0.26 if these are right, else at
+least 3.9."""
 CLIPS, CLIP = 6, 6  # runs of photographs consecutive by name, and photographs of each
 SIDE = 500  # longer side of reduced photographs, pixels; twice that of 360-degree pictures
 FEATURES, COARSE = 1500, 128  # per photograph; largest ones that decide on likeness

@@ -18,17 +18,14 @@ FISHEYE = ColmapCamera("OPENCV_FISHEYE", 200, 200, (FOCAL, FOCAL, RADIUS, RADIUS
 
 def rays_of(lens: Lens) -> np.ndarray:
     """Compute unit rays [h, w, 3] of a view's pixels in the axes of the photograph's camera."""
-    to = lens.pinhole
-    x, y = np.meshgrid((np.arange(to.width) + 0.5 - to.cx) / to.fx, (np.arange(to.height) + 0.5 - to.cy) / to.fy)
-    rays = np.stack([x, y, np.ones_like(x)], -1) @ lens.turn[:3, :3].T
+    rays = lens.pinhole.rays @ lens.turn[:3, :3].T
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
 def directions(lens: Lens, width: int, height: int) -> np.ndarray:
     """Render a photograph whose colors are the directions, [height, width, 3]."""
-    camera = lens.camera.colmap
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = camera.cam_ray_from_img(np.stack([x, y], -1).reshape(-1, 2)).reshape(height, width, 3)
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1) + 0.5
+    rays = lens.camera.colmap.cam_ray_from_img(pixels.reshape(-1, 2)).reshape(height, width, 3)
     return np.nan_to_num((rays * 0.5 + 0.5) * 255.0).round().clip(0, 255).astype(np.uint8)
 
 
@@ -48,17 +45,14 @@ def test_a_panorama_becomes_six_faces_that_show_each_direction_once() -> None:
 def test_a_fisheye_of_180_degrees_is_used_to_more_than_nine_tenths() -> None:
     lenses = lenses_of(FISHEYE, FISHEYE.size, "camera 1")
     assert [lens.face for lens in lenses] == ["front", "right", "left", "up", "down"]
-    camera = FISHEYE.colmap
-    x, y = np.meshgrid(np.arange(200) + 0.5, np.arange(200) + 0.5)
-    circle = np.hypot(x - 100.0, y - 100.0) < RADIUS
-    used = np.zeros((200, 200), bool)
-    rays = camera.cam_ray_from_img(np.stack([x, y], -1)[circle])
+    pixels = np.stack(np.meshgrid(np.arange(200), np.arange(200)), -1) + 0.5
+    circle, used = np.linalg.norm(pixels - 100.0, axis=-1) < RADIUS, np.zeros((200, 200), bool)
+    rays = FISHEYE.colmap.cam_ray_from_img(pixels[circle])
     for lens in lenses:
-        local = rays @ lens.turn[:3, :3]
+        (x, y, z), to = (rays @ lens.turn[:3, :3]).T, lens.pinhole
         with np.errstate(divide="ignore", invalid="ignore"):
-            u = lens.pinhole.fx * local[:, 0] / local[:, 2] + lens.pinhole.cx
-            v = lens.pinhole.fy * local[:, 1] / local[:, 2] + lens.pinhole.cy
-        inside = (local[:, 2] > 0) & (u >= 0) & (v >= 0) & (u < lens.pinhole.width) & (v < lens.pinhole.height)
+            u, v = to.fx * x / z + to.cx, to.fy * y / z + to.cy
+        inside = (z > 0) & (u >= 0) & (v >= 0) & (u < to.width) & (v < to.height)
         covered = np.zeros_like(inside)
         mask = np.asarray(lens.undistort_mask(None, None))
         covered[inside] = mask[v[inside].astype(int), u[inside].astype(int)]

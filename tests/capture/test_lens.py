@@ -45,9 +45,7 @@ def test_pixels_come_from_where_the_camera_saw_their_rays(model: str, f: float) 
     for one in lenses:
         to = one.pinhole
         assert max(to.view) <= MAX_VIEW_ANGLE + 0.01 or not one.distorts
-        x, y = np.meshgrid(np.arange(to.width) + 0.5, np.arange(to.height) + 0.5)
-        rays = np.stack([(x - to.cx) / to.fx, (y - to.cy) / to.fy, np.ones_like(x)], -1).reshape(-1, 3)
-        rays = rays @ one.turn[:3, :3].T
+        rays = to.rays.reshape(-1, 3) @ one.turn[:3, :3].T
         seen = camera.img_from_cam(rays).reshape(to.height, to.width, 2)
         shown = np.ones(seen.shape[:2], bool) if one.whole else one.coverage
         assert (seen[shown] >= 0.0).all() and (seen[shown] <= SIZE).all()  # no extrapolation

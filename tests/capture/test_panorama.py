@@ -106,14 +106,19 @@ def test_what_metadata_say(tmp_path: Path, suffix: str) -> None:
     assert [has_panorama_metadata(path) for path in (marked, plain, tmp_path / "none.jpg")] == [True, False, False]
 
 
-@pytest.mark.slow
-def test_they_get_poses_as_pictures_of_all_directions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def walk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "walk").mkdir()
+    return tmp_path / "walk"
+
+
+@pytest.mark.slow
+def test_they_get_poses_as_pictures_of_all_directions(walk: Path) -> None:
     centres = [(-1.0 + 0.4 * i, -1.3 + 0.1 * i * i, 1.3 + 0.1 * (i % 2)) for i in range(5)]
     for i, centre in enumerate(centres):
-        Image.fromarray(panorama(0.3 * i, 512, centre)).save(tmp_path / f"walk/{i}.png")
-    found = find_poses(tmp_path / "walk")
+        Image.fromarray(panorama(0.3 * i, 512, centre)).save(walk / f"{i}.png")
+    found = find_poses(walk)
     model = pycolmap.Reconstruction(found.model)
     assert found.registered == 5 and [c.model_name for c in model.cameras.values()] == [SPHERICAL_MODEL]
     at = {int(Path(image.name).stem): image.projection_center() for image in model.images.values()}
@@ -121,28 +126,25 @@ def test_they_get_poses_as_pictures_of_all_directions(tmp_path: Path, monkeypatc
     assert np.abs(ours / ours.mean() - true / true.mean()).max() < 0.03
 
 
-def test_those_of_less_than_all_directions_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    (tmp_path / "walk").mkdir()
+def test_those_of_less_than_all_directions_are_refused(walk: Path) -> None:
     for i in range(4):
-        Image.fromarray(panorama(0.3 * i, 64)[:, : 128 - 40]).save(tmp_path / f"walk/{i}.png")
+        Image.fromarray(panorama(0.3 * i, 64)[:, : 128 - 40]).save(walk / f"{i}.png")
     with pytest.raises(CaptureError, match="4 of 4 photographs .* are panoramas .* show all directions"):
-        find_poses(tmp_path / "walk", SfmOptions(camera_model="EQUIRECTANGULAR"))
+        find_poses(walk, SfmOptions(camera_model="EQUIRECTANGULAR"))
 
 
 @pytest.mark.slow
-def test_points_are_triangulated_from_panoramas_with_poses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def test_points_are_triangulated_from_panoramas_with_poses(walk: Path) -> None:
     axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])  # the middle column looks along -x
     views = []
     for i in range(4):
         centre = np.array([-1.0 + 0.4 * i, -1.3 + 0.1 * i * i, 1.3])
-        Image.fromarray(panorama(0.0, 512, tuple(centre.tolist()))[:, ::-1]).save(tmp_path / f"{i}.png")
+        Image.fromarray(panorama(0.0, 512, tuple(centre.tolist()))[:, ::-1]).save(walk / f"{i}.png")
         pose = np.eye(4)
         pose[:3] = np.column_stack([axes.T * (1, -1, -1), centre])
         camera = ColmapCamera(SPHERICAL_MODEL, 1024, 512, (1024.0, 512.0))
-        views.append(Photograph(tmp_path / f"{i}.png", camera, pose, ""))
-    model = pycolmap.Reconstruction(triangulate(tmp_path, views))
+        views.append(Photograph(walk / f"{i}.png", camera, pose, ""))
+    model = pycolmap.Reconstruction(triangulate(walk, views))
     xyz = np.array([point.xyz for point in model.points3D.values()])
     inside = ((xyz > np.array([-3.05, -2.55, -0.05])) & (xyz < np.array([3.05, 2.55, 2.65]))).all(1)
     assert len(xyz) > 50 and inside.mean() > 0.9

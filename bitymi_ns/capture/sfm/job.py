@@ -37,7 +37,7 @@ class Job:
 
     work: str  # folder for the database and the model
     images: str
-    """Folder of the photographs, or of links to them, under names without spaces, which COLMAP's lists cannot have."""
+    """Folder of the photographs, or of links to them; spaces in names would separate entries of COLMAP's lists."""
     masks: str | None  # folder of masks by COLMAP's names, of the size of the photographs
     cameras: list[CameraGroup]
     order: list[str]  # all photographs by time or name

@@ -46,31 +46,21 @@ class Projection:
 
     With (dx, dy) the offset in pixels from the projected centre (cx, cy), a pixel's ray meets the surfel at
     u = (u1 dx + u2 dy) / W, v = (v1 dx + v2 dy) / W, W = w0 + w1 dx + w2 dy, at depth z w0 / W (csrc/core/surfel.h).
-
-    Attributes:
-        geom: [N, 16] (`constants.GEOM`), differentiable.
-        frames: [N, 9] mean, s_u t_u, s_v t_v in the world frame, differentiable.
-        radii: [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0: not visible.
-        near: nearest depth that is drawn, camera z.
-        photo_pixel: side of a photograph's pixel in pixels of the view; if not 1, only the baked renderer can use it.
-        broken: [1] int32, number of surfels dropped because a parameter is NaN or infinite.
-        mean2d_grad: [N, 2] after backward: gradient with respect to the projected centre, in pixels.
-        mean2d_absgrad: [N, 2] after backward: the same, with absolute values per fragment before the sum.
-        whole: the view of which this is a band (ops/bands.py).
-        alpha: alpha texels; None: opaque.
     """
 
-    geom: Tensor
-    frames: Tensor
-    radii: Tensor
+    geom: Tensor  # [N, 16] (`constants.GEOM`), differentiable
+    frames: Tensor  # [N, 9] mean, s_u t_u, s_v t_v in the world frame, differentiable
+    radii: Tensor  # [N, 2] half extents in pixels of the box in which a surfel can reach alpha 1/255; 0: not visible
     camera: CameraLike
-    near: float
-    broken: Tensor
-    photo_pixel: float = 1.0
+    near: float  # nearest depth that is drawn, camera z
+    broken: Tensor  # [1] int32, number of surfels dropped because a parameter is NaN or infinite
+    photo_pixel: float = 1.0  # side of a photograph's pixel in pixels of the view; not 1 in the baked renderer only
+    # [N, 2] after backward: gradient with respect to the projected centre, in pixels; and with absolute values per
+    # fragment before the sum
     mean2d_grad: Tensor | None = None
     mean2d_absgrad: Tensor | None = None
-    whole: Projection | None = None
-    alpha: TexelAlpha | None = None
+    whole: Projection | None = None  # the view of which this is a band (ops/bands.py)
+    alpha: TexelAlpha | None = None  # None: opaque
 
     def detached(self) -> Projection:
         """Return the projection without its graph."""

@@ -16,16 +16,11 @@ class TexelTiles:
 
     Texel (i, j) of surfel s, i along u and j along v, is row first[s] + j r_u + i; its centre lies at
     u = (i + 0.5) / r_u * 2e - e, v likewise.
-
-    Attributes:
-        first: [N] int64.
-        size: [N, 2] int32 (r_u, r_v); (0, 0): no tile.
-        extent: [N] half side e of the tile in scale units, of the texels' dtype.
     """
 
-    first: Tensor
-    size: Tensor
-    extent: Tensor
+    first: Tensor  # [N] int64
+    size: Tensor  # [N, 2] int32 (r_u, r_v); (0, 0): no tile
+    extent: Tensor  # [N] half side e of the tile in scale units, of the texels' dtype
 
     @classmethod
     def of_sizes(cls, size: Tensor, extent: Tensor) -> TexelTiles:
@@ -53,16 +48,10 @@ class TexelTiles:
 @dataclass(frozen=True)
 class TexelAlpha:
     """Opacity factors by texel: sigma = min(0.99, sigma0 m) for fragments whose weight sigma0 T would be at least
-    `bound`, with m the bilinear fetch at (u, v). Fragments with sigma0 < 1/255 are skipped for any m.
-
-    Attributes:
-        tiles: of the texels.
-        values: [T] m, from 0 to 2.
-        bound: fragments of smaller weight keep their sigma.
-    """
+    `bound`, with m the bilinear fetch at (u, v). Fragments with sigma0 < 1/255 are skipped for any m."""
 
     tiles: TexelTiles
-    values: Tensor
+    values: Tensor  # [T] m, from 0 to 2
     bound: float
 
     def of(self, surfels: Tensor) -> TexelAlpha:

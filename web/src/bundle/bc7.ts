@@ -12,15 +12,16 @@ interface Mode {
   index: number;
   index2: number;
 }
+const PLAIN = { partition: 0, rotation: 0, selector: 0, alpha: 0, index2: 0 };
 const MODES: Mode[] = [
-  { subsets: 3, partition: 4, rotation: 0, selector: 0, color: 4, alpha: 0, shared: 'endpoint', index: 3, index2: 0 },
-  { subsets: 2, partition: 6, rotation: 0, selector: 0, color: 6, alpha: 0, shared: 'subset', index: 3, index2: 0 },
-  { subsets: 3, partition: 6, rotation: 0, selector: 0, color: 5, alpha: 0, shared: 'none', index: 2, index2: 0 },
-  { subsets: 2, partition: 6, rotation: 0, selector: 0, color: 7, alpha: 0, shared: 'endpoint', index: 2, index2: 0 },
-  { subsets: 1, partition: 0, rotation: 2, selector: 1, color: 5, alpha: 6, shared: 'none', index: 2, index2: 3 },
-  { subsets: 1, partition: 0, rotation: 2, selector: 0, color: 7, alpha: 8, shared: 'none', index: 2, index2: 2 },
-  { subsets: 1, partition: 0, rotation: 0, selector: 0, color: 7, alpha: 7, shared: 'endpoint', index: 4, index2: 0 },
-  { subsets: 2, partition: 6, rotation: 0, selector: 0, color: 5, alpha: 5, shared: 'endpoint', index: 2, index2: 0 },
+  { ...PLAIN, subsets: 3, partition: 4, color: 4, shared: 'endpoint', index: 3 },
+  { ...PLAIN, subsets: 2, partition: 6, color: 6, shared: 'subset', index: 3 },
+  { ...PLAIN, subsets: 3, partition: 6, color: 5, shared: 'none', index: 2 },
+  { ...PLAIN, subsets: 2, partition: 6, color: 7, shared: 'endpoint', index: 2 },
+  { ...PLAIN, subsets: 1, rotation: 2, selector: 1, color: 5, alpha: 6, shared: 'none', index: 2, index2: 3 },
+  { ...PLAIN, subsets: 1, rotation: 2, color: 7, alpha: 8, shared: 'none', index: 2, index2: 2 },
+  { ...PLAIN, subsets: 1, color: 7, alpha: 7, shared: 'endpoint', index: 4 },
+  { ...PLAIN, subsets: 2, partition: 6, color: 5, alpha: 5, shared: 'endpoint', index: 2 },
 ];
 const WEIGHTS: Record<number, number[]> = {
   2: [0, 21, 43, 64],

@@ -23,12 +23,12 @@ TRANSMITTANCE_MIN: float = _compiled("TRANSMITTANCE_MIN")
 """A pixel ends before the fragment that would leave less transmittance."""
 BETA_MAX: float = _compiled("BETA_MAX")  # beta = BETA_MAX sigmoid(beta_raw)
 COLOR_BIAS: float = _compiled("COLOR_BIAS")  # added to f_view before the inner ReLU
-SH_C0: float = _compiled("SH_C0")  # value of the spherical harmonic of degree 0
-LOG_TAU_MAX: float = _compiled("LOG_TAU_MAX")  # upper bound of logarithms of temperatures and sharpnesses
+SH_C0: float = _compiled("SH_C0")  # spherical harmonic of degree 0
+LOG_TAU_MAX: float = _compiled("LOG_TAU_MAX")  # of temperatures and sharpnesses
 MAX_TERMS: int = _compiled("MAX_TERMS")  # most sites or lobes of a view colour
 FEATURES: int = _compiled("FEATURES")  # features per level of the field
-WIDTH: int = _compiled("WIDTH")  # width of both hidden layers of the field
-MAX_LEVELS: int = _compiled("MAX_LEVELS")  # most levels of the field
+WIDTH: int = _compiled("WIDTH")  # of both hidden layers of the field
+MAX_LEVELS: int = _compiled("MAX_LEVELS")  # of the field
 TILE: int = _compiled("TILE")  # side of a screen tile, pixels
 GEOM: int = _compiled("GEOM")
 """Columns of a row of `geom`: cx, cy, u1, u2, v1, v2, w0, w1, w2, z, opacity, beta, normal (3), area."""

@@ -31,12 +31,12 @@ class Parameter:
     limit: Limit  # allowed in a bundle
     rate: str  # learning rate, a field of `train.config.LearningRates`, multiplied by:
     rate_factor: float = 1.0
-    activation: str | None = None  # activation of a view colour as stated in bundle.json; None: not stated
+    activation: str | None = None  # of a view colour as stated in bundle.json; None: not stated
     columns: tuple[str, ...] | None = None  # columns of surfels.ply; None: <name>_<i>
     code: str | None = None  # column of surfels.bin; None: its name
     step: float | None = None  # reference step of that column, coded number by number; None: not coded so
     start: float | None = None  # value of a new surfel; None: `train.init` has it
-    absent: float | None = None  # its value in bundles that lack it, as of earlier versions; None: all have it
+    absent: float | None = None  # value in bundles of earlier versions, which lack it; None: all have it
     least: float | None = None  # coded as sigmoids, from this to 1 - `SMALLEST_SHARE`; None: coded as they are
 
     @property

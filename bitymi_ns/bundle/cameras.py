@@ -29,9 +29,9 @@ def _gains_or_rows(numbers: list[float]) -> list[float]:
 class CapturedCamera(BaseModel):
     """A camera of the capture, and its photograph: size, focal lengths and principal point in pixels.
 
-    `viewmat`: [16] world to camera by rows, OpenCV axes. `photograph`: file of the bundle, possibly reduced.
-    `correction`: maps colours of the scene, but not the background, to the photograph's: 3 gains, or matrix and offset
-    [3, 4] by rows; None: mean exposure."""
+    `viewmat`: world to camera by rows, OpenCV axes. `photograph`: file of the bundle, possibly reduced. `correction`:
+    maps colours of the scene, but not the background, to the photograph's: 3 gains, or matrix and offset [3, 4] by
+    rows; None: mean exposure."""
 
     name: str
     held_out: bool

@@ -34,8 +34,8 @@ MOST_COEFFICIENT = 1 << 24
 def encode_surfels(
     codes: SurfelCodes, residual: Codes, residual_step: float, alpha: Codes | None, digest: Digest
 ) -> tuple[dict[str, Any], bytes]:
-    """Encode surfels.bin; returns its entries in bundle.json and its bytes. `residual`: [N, 3] mean residuals in steps
-    (green, red - green, blue - green). `alpha`: [N] mean alphas, 128 = 1; None: opaque."""
+    """Encode surfels.bin; returns its entries in bundle.json and its bytes. `residual`, `alpha`: [N, 3] and [N], as in
+    `SceneCodes`."""
     columns = {**codes.columns, "residual": residual}
     if alpha is not None:
         columns["alpha"] = alpha[:, None]

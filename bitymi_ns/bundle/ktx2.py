@@ -12,7 +12,7 @@ IDENTIFIER = b"\xabKTX 20\xbb\r\n\x1a\n"
 
 _HEADER = struct.Struct("<12s9I4I2Q3Q")  # identifier, header, index, the level
 _KEY_LIMIT = 1 << 20
-HEADER_LIMIT = 1 << 10  # bound in bytes of header, index, level and data format descriptor
+HEADER_LIMIT = 1 << 10  # bytes of header, index, level and data format descriptor, at most
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def layer_bytes(format: Format, width: int, height: int) -> int:
 
 
 def descriptor(format: Format) -> bytes:
-    """Build the Data Format Descriptor: a basic descriptor block with linear transfer and BT.709 primaries."""
+    """Build the Data Format Descriptor: a basic block with linear transfer and BT.709 primaries."""
     layout = _LAYOUTS[format]
     size = 24 + 16 * len(layout.samples)
     block = struct.pack("<IHH", 0, 2, size)  # Khronos, basic format, version 1.3

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
 
 from bitymi_ns.ranges import first_problem
-from bitymi_ns.scene.crop import Box, Crop, vector
+from bitymi_ns.scene.crop import Box, Crop
 from . import strict_json
 from .manifest import BundleError
 from .parts import NOTES, Parts, notes_data, parts_of
@@ -22,7 +22,7 @@ FARTHEST = 1e9
 
 
 class NotesError(BundleError):
-    """A notes.json that is refused, or a crop that cannot be applied; the rest of the bundle can be read."""
+    """A notes.json that is refused, or a crop that cannot be applied."""
 
 
 def _printable(text: str) -> str:
@@ -133,7 +133,7 @@ class Notes(_Strict):
     @property
     def cropping(self) -> Crop:
         box, floor = (None, None) if self.crop is None else (self.crop.box, self.crop.floor)
-        plane = None if floor is None else (vector(floor.normal), floor.offset)
+        plane = None if floor is None else (tuple(floor.normal), floor.offset)
         return Crop(None if box is None else _box(box), plane, tuple(map(_box, self.hidden)))
 
 
@@ -175,7 +175,7 @@ def _refusal(source: str, what: str) -> NotesError:
 
 
 def read_notes(parts: Parts) -> tuple[bytes, Notes] | None:
-    """Read and check a bundle's notes.json: bytes and contents; None if there is none. Raises BundleError."""
+    """Read and check a bundle's notes.json: bytes and contents. Raises BundleError."""
     data = notes_data(parts)
     return None if data is None else (data, parse_notes(data, str(parts.bundle / NOTES)))
 
@@ -194,7 +194,7 @@ def hides(bundle: str | Path) -> bool:
 
 
 def notes_of(bundle: str | Path) -> bytes | None:
-    """Read a bundle's notes.json for copying, but no link out of the folder. Raises as `read_notes`."""
+    """Read a bundle's notes.json for copying. Raises as `read_notes`."""
     with parts_of(bundle, inside=True) as parts:
         notes = read_notes(parts)
     return None if notes is None else notes[0]

@@ -34,7 +34,7 @@ def most_bytes(scene: int) -> int:
 
 def encode_poster(pixels: Pixels, most: int) -> bytes | None:
     """Encode a picture [H, W, 3] as lossy WebP of at most `most` bytes: the best quality that fits, else fewer pixels.
-    None, as posters are optional: nothing fits, or this Pillow cannot write WebP."""
+    None: nothing fits, or this Pillow cannot write WebP."""
     if not features.check("webp"):
         return None
     image = Image.fromarray(pixels)

@@ -26,7 +26,7 @@ class SingleFile:
 
     first: int  # from the start to the end of the surfels
     bytes: int
-    left_out: list[str]  # files listed in bundle.json that are not of the format and were not written
+    left_out: list[str]  # as `parts.left_out`
 
 
 def write_single(bundle: str | Path, path: str | Path) -> SingleFile:
@@ -77,9 +77,9 @@ def joined(bundle: str | Path) -> tuple[bytes, SingleFile]:
 
 
 def write_folder(bundle: str | Path, folder: Path, beside: Mapping[str, bytes]) -> list[str]:
-    """Write the files of a bundle, a folder or single file, to a missing or empty folder, atomically. `beside`: further
-    files by name, not covered by bundle.json. Returns `SingleFile.left_out`. Raises BundleError: as `write_single`, or
-    the folder is occupied. Raises OSError: it cannot be written."""
+    """Write the files of a bundle to a missing or empty folder, atomically. `beside`: further files by name. Returns
+    `SingleFile.left_out`. Raises BundleError: as `write_single`, or the folder is occupied. Raises OSError: it cannot
+    be written."""
 
     def check() -> None:
         if os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir())):

@@ -118,7 +118,7 @@ def _tiles(bundle: Bundle) -> Check:
 
 
 def _count_tiles(tiles: Tensor, atlas: Tensor | None) -> Tensor:
-    """Count the tiles over each 4 x 4 block, [layers, height / 4, width / 4], by 2D prefix sums of corner marks."""
+    """Count the tiles over each 4 x 4 block, [layers, height / 4, width / 4], by prefix sums of corner marks."""
     layers, height, width = (1, 4, 4) if atlas is None else atlas.shape[:3]
     counts = torch.zeros(layers, height // 4 + 1, width // 4 + 1, dtype=torch.int32)
     x, y, layer, r_u, r_v = tiles.unbind(1)

@@ -29,7 +29,7 @@ def limit_of(name: str, kind: str) -> Limit:
 
 
 def beyond(name: str, kind: str, values: Tensor) -> Tensor:
-    """Compute the mask, of the shape of `values` [N] or [N, ...], of values beyond the limit of their parameter."""
+    """Compute the mask of `values`, [N] or [N, ...], beyond the limit of their parameter."""
     largest = limit_of(name, kind)
     most = torch.tensor(largest, device=values.device, dtype=torch.float32) if values.dim() > 1 else largest[0]
     return values.abs() > most

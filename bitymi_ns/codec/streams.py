@@ -56,7 +56,7 @@ def decompress(view: memoryview, rows: int, sizes: Sequence[int], blocks: int = 
 
 
 def _others(before: Others, number: npt.NDArray[np.int64], blocks: int) -> Others:
-    """Add a number's magnitudes [rows] to the sums of those before it, clipped at `_OTHERS`; None without blocks."""
+    """Add a number's magnitudes to the sums of those before it, clipped at `_OTHERS`; None without blocks."""
     if not blocks:
         return None
     least = np.clip(np.abs(number), 0, _OTHERS).astype(np.uint8)

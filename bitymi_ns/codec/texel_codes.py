@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -110,14 +109,12 @@ class TexelCodes:
     @property
     def columns(self) -> dict[str, npt.NDArray[np.integer]]:
         """The columns of texels.bin: name to [tiles, 1] grades, or [coefficients, blocks, numbers]."""
-        columns = {"grade": self.grades.numpy()[:, None]}
         names, alphas = coefficient_columns(blocks_of(self.sizes))
-        parts = zip(names, self.coefficients, strict=True)
+        coefficients = list(self.coefficients)
         if self.alpha is not None:
-            parts = chain(parts, zip(alphas, self.alpha.coefficients, strict=True))
-        for name, values in parts:
-            columns[name] = values.numpy()
-        return columns
+            names, coefficients = names + alphas, coefficients + list(self.alpha.coefficients)
+        named = zip(names, (values.numpy() for values in coefficients), strict=True)
+        return {"grade": self.grades.numpy()[:, None], **dict(named)}
 
     def nbytes(self) -> int:
         """Count the bytes of texels.bin, and of residuals and mean alphas in surfels.bin."""

@@ -1,4 +1,4 @@
-"""Nearest quads of a mesh at the pixels of a view, by a depth buffer with alpha mask; torch on the CPU."""
+"""Nearest quads of a mesh at the pixels of a view, by a depth buffer with alpha mask."""
 
 import math
 from collections.abc import Iterator

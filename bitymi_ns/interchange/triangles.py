@@ -131,7 +131,7 @@ def _keys(faces: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDAr
 
 
 def _joined(mesh: Triangles, to: npt.NDArray[np.int64]) -> Triangles:
-    """Replace vertex i by `to[i]`, [V]; remove degenerate and duplicate triangles, and pairs facing opposite ways."""
+    """Replace vertex i by `to[i]`; remove degenerate and duplicate triangles, and pairs facing opposite ways."""
     faces = to[mesh.faces]
     a, b, c = faces.T
     full = np.flatnonzero((a != b) & (b != c) & (c != a))
@@ -145,7 +145,7 @@ def _joined(mesh: Triangles, to: npt.NDArray[np.int64]) -> Triangles:
 
 
 def _in_largest_fans(faces: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Find the triangles, [F] bool, whose corners are all in the largest fan of adjacent ones around their vertex."""
+    """Find the triangles, [F] bool, whose corners are all in the largest fan around their vertex."""
     count = len(faces)
     corner = np.arange(3 * count).reshape(3, count)  # of the first vertices, the second, the third
     first, second = corner.ravel(), np.roll(corner, -1, axis=0).ravel()  # corners at both ends of `_directed` edges

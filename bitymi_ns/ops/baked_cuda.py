@@ -18,7 +18,7 @@ from .view_kinds import VIEW_COLORS
 
 
 def draws_blocks(device: torch.device) -> bool:
-    """Return True if the texture unit of a CUDA device decodes BC7 blocks, tested by drawing some."""
+    """Return True if a CUDA device's texture unit decodes BC7 blocks, tested by drawing some."""
     with on_device(device):
         return lookup("draws_bc7", device)()
 
@@ -40,8 +40,8 @@ class Sheet(NamedTuple):
 
     @classmethod
     def of(cls, pages: int, height: int, width: int) -> Sheet:
-        """Lay out pages of equal size in columns of up to 2^14 rows: every texture format allows that many, and
-        coordinates keep the texture unit's fractional bits."""
+        """Lay out pages of equal size in columns of up to 2^14 rows, which every texture format allows; coordinates
+        keep the texture unit's fractional bits."""
         height, width = -(-height // 4) * 4, -(-width // 4) * 4  # corners on the grid of the coarsest level
         return cls(max(1, min(pages, 2**14 // height)), width, height)
 

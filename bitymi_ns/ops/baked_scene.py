@@ -104,7 +104,7 @@ def check_images(names: Sequence[str], on_cuda: bool) -> None:
 
 
 def packed(rgb: Tensor, alpha: Tensor) -> Tensor:
-    """Convert colours over the background [..., 3] and coverage [..., 1] to the image `packed`, [..., 1] int32."""
+    """Convert images rgb [..., 3] and alpha [..., 1] to packed, [..., 1] int32."""
     byte = (torch.cat([rgb, alpha], -1).clamp(0.0, 1.0) * 255.0 + 0.5).to(torch.int32)
     return byte[..., :1] | byte[..., 1:2] << 8 | byte[..., 2:3] << 16 | byte[..., 3:] << 24
 

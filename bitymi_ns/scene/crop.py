@@ -10,16 +10,11 @@ from torch import Tensor
 
 from bitymi_ns.ops.reference.project import rotation
 
-Vector = tuple[float, float, float]
+Vector = tuple[float, ...]  # three numbers
 
 
 def _tensor(numbers: Sequence[float] | Sequence[Sequence[float]]) -> Tensor:
     return torch.tensor(numbers, dtype=torch.float64)
-
-
-def vector(numbers: Sequence[float]) -> Vector:
-    x, y, z = numbers
-    return x, y, z
 
 
 @dataclass(frozen=True)
@@ -28,7 +23,7 @@ class Box:
 
     center: Vector
     half: Vector  # half sides along the axes
-    axes: tuple[Vector, Vector, Vector]  # rows of a rotation matrix, whose columns are the axes
+    axes: tuple[Vector, ...]  # rows of a rotation matrix, whose columns are the axes
 
     @classmethod
     def rotated(cls, center: Sequence[float], half: Sequence[float], quat: Sequence[float]) -> Box:
@@ -37,8 +32,7 @@ class Box:
 
     @classmethod
     def of(cls, center: Sequence[float], half: Sequence[float], axes: Sequence[Sequence[float]]) -> Box:
-        x, y, z = map(vector, axes)
-        return cls(vector(center), vector(half), (x, y, z))
+        return cls(tuple(center), tuple(half), tuple(map(tuple, axes)))
 
     def contains(self, points: Tensor) -> Tensor:
         """Tell which of the points [N, 3] lie in the box, [N] bool."""

@@ -201,7 +201,7 @@ def serve(
     site: Site, host: str = LOOPBACK, port: int = 0, request_seconds: float = REQUEST_SECONDS
 ) -> ThreadingHTTPServer:
     """Create a listening server; call its `serve_forever`. On a loopback `host`, requests for another host name are
-    refused, against DNS rebinding by web pages. `port`: 0: any free port. `request_seconds`: timeout of receiving a
+    refused, against DNS rebinding by web pages. `port`: 0: any free one. `request_seconds`: timeout of receiving a
     request. Raises PageError: the address cannot be used."""
     if not 0 <= port <= 0xFFFF:
         raise PageError(f"the port must be from 0 to 65535, not {port}")

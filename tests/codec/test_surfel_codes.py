@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from bitymi_ns.codec.limits import EXTENTS, LIMITS
-from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, code_surfels, morton_cells, morton_codes, reordered
+from bitymi_ns.codec.surfel_codes import REFERENCE, code_surfels, reordered
 from bitymi_ns.ops.view_color import view_color
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere
 from tests.bundle.compact_scene import reduced_surfels
@@ -40,12 +40,6 @@ def test_values_are_within_half_a_step(kind: str) -> None:
         at, eye = direction.expand(COUNT, 3).contiguous(), torch.zeros(3)
         colors = [view_color(kind, each, at, eye) for each in (want, got)]
         assert float((colors[0] - colors[1]).abs().median()) < 0.01
-
-
-def test_cells_come_back_from_their_places() -> None:
-    cell = np.random.default_rng(0).integers(0, 1 << POSITION_BITS, (50, 3))
-    np.testing.assert_array_equal(morton_cells(morton_codes(cell)[:, None]), cell)
-    assert morton_codes(cell).max() < 1 << (3 * POSITION_BITS) <= 1 << 53
 
 
 def test_far_surfels_keep_their_limits_and_near_ones_their_places() -> None:

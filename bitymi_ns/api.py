@@ -160,9 +160,9 @@ def rasterize(
 
 def _check_ranges(**ranges: tuple[Tensor, float, float]) -> None:
     wrong = {name: ~((values >= low) & (values <= high)) for name, (values, low, high) in ranges.items()}
-    if not torch.stack([each.any() for each in wrong.values()]).any():  # one wait for the device
+    if not torch.stack([rows.any() for rows in wrong.values()]).any():  # one wait for the device
         return
-    name = next(name for name, each in wrong.items() if each.any())
+    name = next(name for name, rows in wrong.items() if rows.any())
     (values, low, high), row = ranges[name], tuple(wrong[name].nonzero()[0].tolist())
     limits = "above 0 and finite" if 0.0 < low else f"from {low:g} to {high:g}"
     raise ValueError(f"{name} have to be {limits}: {name}{list(row)} is {values[row].item():g}")

@@ -254,8 +254,8 @@ class Extras:
         say(f"Wrote {output}" + (bundle.hidden and f"; {bundle.hidden}"))
         if removed:
             say(removed)
-        for each in written.values():
-            say(extras.summary_line(each))
+        for entry in written.values():
+            say(extras.summary_line(entry))
         if not cameras:
             say("The bundle has no cameras.json: colours are those over the whole sphere, the mesh's as they are.")
 

@@ -66,7 +66,7 @@ def end_as_by_ctrl_c() -> list[signal.Signals]:
     or ignored. Return those that changed."""
     if threading.current_thread() is not threading.main_thread():
         return []
-    changed = [each for each in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(each) == signal.SIG_DFL]
+    changed = [number for number in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(number) == signal.SIG_DFL]
     for number in changed:
         signal.signal(number, signal.default_int_handler)
     return changed

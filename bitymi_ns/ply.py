@@ -53,8 +53,8 @@ class Header:
         """Count the lines (of a text file) or bytes between the header and an element's rows; None if unknown because
         of lists."""
         total = 0
-        for other, element in self.elements.items():
-            if other == name:
+        for earlier, element in self.elements.items():
+            if earlier == name:
                 break
             if self.order and element.row is None:
                 return None
@@ -213,10 +213,10 @@ def parse_ply(data: bytes | bytearray) -> dict[str, dict[str, npt.NDArray]]:
     """Parse a whole file: element to name to [N] float32 or int32 array, in the file's order. Raises PlyError: as
     `header_of`, or a value is not finite."""
     header = header_of(data, len(data))
-    elements, at = {}, header.start
+    elements, offset = {}, header.start
     for element, declared in header.elements.items():
-        rows = np.frombuffer(data, dtype=declared.row, count=declared.count, offset=at)
-        at += rows.nbytes
+        rows = np.frombuffer(data, dtype=declared.row, count=declared.count, offset=offset)
+        offset += rows.nbytes
         elements[element] = {name: np.ascontiguousarray(rows[name]) for name in declared.names}
         for name, column in elements[element].items():
             bad = ~np.isfinite(column)

@@ -25,9 +25,9 @@ def first_problem(error: ValidationError) -> tuple[str, str]:
 
 def describe_problems(error: ValidationError) -> str:
     """Describe the first three validation errors in one line."""
-    found = error.errors(include_url=False, include_context=False)
-    more = len(found) - _MOST_PROBLEMS
-    return "; ".join(map(_problem, found[:_MOST_PROBLEMS])) + (f" (and {more} more)" if more > 0 else "")
+    problems = error.errors(include_url=False, include_context=False)
+    more = len(problems) - _MOST_PROBLEMS
+    return "; ".join(map(_problem, problems[:_MOST_PROBLEMS])) + (f" (and {more} more)" if more > 0 else "")
 
 
 def _problem(detail: Any) -> str:

@@ -44,11 +44,11 @@ def bitymi_parser(config: DataParserConfig) -> DataParserConfig:
     format = STOCK_FORMATS.get(type(config))
     if format is None:
         return config
-    ours = {each.name for each in fields(BitymiDataParserConfig)} - {"_target"}
+    ours = {option.name for option in fields(BitymiDataParserConfig)} - {"_target"}
     if format == "instant-ngp":
         ours -= {"scale_factor", "scene_scale"}  # there scene_scale multiplies the positions
     options, stock = {}, type(config)()
-    for name in (each.name for each in fields(config)):
+    for name in (option.name for option in fields(config)):
         value = getattr(config, name)
         if name in ours:
             options[name] = value

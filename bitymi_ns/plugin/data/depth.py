@@ -69,10 +69,10 @@ def with_depth(
     fit_of = dict(zip(rows, fits, strict=True)) if fits is not None else {}
     fitted = [FittedMaps(files, fit_of.get(i), unit) for i, files in enumerate(maps)]
     metadata = {**outputs.metadata, KEY: dataclasses.replace(facts, fitted=fitted)}
-    used = [(i, each.fitted(fit)) for i, each in zip(rows, seen, strict=True) if (fit := fit_of.get(i)) is not None]
+    used = [(i, view.fitted(fit)) for i, view in zip(rows, seen, strict=True) if (fit := fit_of.get(i)) is not None]
     pixels = int((outputs.cameras.width.long() * outputs.cameras.height.long()).sum())
     count = min(MOST_POINTS, pixels // PIXELS_PER_POINT) - len(old) if add_points else 0
-    new, rgb = _new_points([each for _, each in used], [outputs.image_filenames[i] for i, _ in used], count)
+    new, rgb = _new_points([view for _, view in used], [outputs.image_filenames[i] for i, _ in used], count)
     if len(new):
         say(f"{len(new):,} initial points are added from depth.")
         own = outputs.metadata.get("points3D_rgb", torch.zeros(0, 3))
@@ -126,10 +126,10 @@ def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
 
 def _fits(seen: Sequence[_Seen], xyz: Floats, kind: DepthKind, unit: float) -> Sequence[DepthFit | None] | None:
     """Fit each map to points [N, 3]; few = metric, of `unit` scene units per metre. None = unused."""
-    if not any(each.values.any() for each in seen):
+    if not any(view.values.any() for view in seen):
         warn("The depth maps have no valid pixel: depth is not used.")
         return None
-    pairs = [_pairs(each, xyz) for each in seen]
+    pairs = [_pairs(view, xyz) for view in seen]
     values, z = (np.concatenate([pair[k] for pair in pairs]) for k in (0, 1))
     if len(z) < FEW_PAIRS:
         if kind == "relative":
@@ -246,9 +246,9 @@ def _new_points(seen: Sequence[_Seen], files: Sequence[Path], count: int) -> tup
     if count < 1 or not seen:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     rng = np.random.default_rng(0)
-    numbers = [np.flatnonzero(each.values) for each in seen]
-    total = sum(map(len, numbers))
-    draws = [rng.choice(each, min(len(each), -(-4 * count * len(each) // total)), replace=False) for each in numbers]
+    known = [np.flatnonzero(view.values) for view in seen]
+    total = sum(map(len, known))
+    draws = [rng.choice(row, min(len(row), -(-4 * count * len(row) // total)), replace=False) for row in known]
 
     def of_view(i: int) -> tuple[Floats, npt.NDArray[np.uint8], Floats]:
         xyz = _unproject(draws[i], seen[i])

@@ -58,7 +58,9 @@ def make_views(
     facts = dataclasses.replace(
         facts,
         maps=maps if set(maps) != {MapFiles()} else (),
-        **{"declares_box": capture.declares_box, "poses_report": capture.report, "poses_found": capture.model},
+        declares_box=capture.declares_box,
+        poses_report=capture.report,
+        poses_found=capture.model,
     )
     metadata: dict[str, Any] = {KEY: facts}
     if points is not None and len(points.xyz):
@@ -89,7 +91,7 @@ def _split(
     sources = [i for i, own in enumerate(parts) for _ in own]
     turns = np.stack([OPENCV_AXES @ lens.turn @ OPENCV_AXES for lens in lenses])
     files = [photographs[i] for i in sources]
-    cameras = pinhole_cameras([each.pinhole for each in lenses], torch.from_numpy(poses[sources] @ turns).float())
+    cameras = pinhole_cameras([lens.pinhole for lens in lenses], torch.from_numpy(poses[sources] @ turns).float())
     names = [lens.name(file) for file, lens in zip(files, lenses, strict=True)]
     return sources, names, cameras, CaptureFacts(lenses, files)
 

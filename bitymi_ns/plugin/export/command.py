@@ -179,8 +179,8 @@ class ExportAtlas(BakeOptions):
             removed = removal_line(self.extras, folder)
             with rich_progress() as progress:
                 written = write_extras(bundle, folder, self.extras, progress=progress, **how)
-            for each in written.values():
-                say(f"In {folder}: {summary_line(each)}")
+            for entry in written.values():
+                say(f"In {folder}: {summary_line(entry)}")
             if removed:
                 say(removed)
 

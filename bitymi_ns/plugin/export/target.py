@@ -42,10 +42,10 @@ def space_needed(load_config: Path, options: BakeOptions, exact: bool) -> int:
 def bundle_version(folder: Path) -> tuple[int, int] | None:
     """Return inode and time of a folder's bundle file; None without one."""
     try:
-        found = (folder / MANIFEST).stat()
+        status = (folder / MANIFEST).stat()
     except OSError:
         return None
-    return found.st_ino, found.st_mtime_ns
+    return status.st_ino, status.st_mtime_ns
 
 
 def bundle_config(config: Any, folder: Path, background: Sequence[float]) -> bytes:

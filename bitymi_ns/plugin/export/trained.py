@@ -119,7 +119,7 @@ def held_out_psnr(model: BitymiModel, datamanager: Any, scene: BakedScene, views
     held_out = datamanager.corrected_eval_views(model.resume_state.get("exposure"))
     for view in (held_out[index].to(model.device) for index in range(min(views, len(held_out)))):
         drawn = model.render(view.camera, background, maps=False), scene.render(view.camera, background)
-        neural, baked = (view.shown(each.rgb, each.alpha, background).clamp(0.0, 1.0) for each in drawn)
+        neural, baked = (view.shown(output.rgb, output.alpha, background).clamp(0.0, 1.0) for output in drawn)
         photo = view.target(background, model.device)
         of_photo = [measure(rgb, photo, view.mask) for measure in (psnr, fitted_psnr) for rgb in (neural, baked)]
         rows.append([psnr(baked, neural, view.mask), *of_photo])

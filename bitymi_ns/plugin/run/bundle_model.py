@@ -124,8 +124,8 @@ def check_same_capture(bundle: Path, pipeline: Any) -> None:
     if not stated:
         return
     data = pipeline.datamanager
-    found = to_cameras(data.train_dataset.cameras, "cpu") + to_cameras(data.eval_dataset.cameras, "cpu")
-    theirs, ours = (torch.stack([camera.viewmat.double() for camera in some]) for some in (stated, found))
+    captured = to_cameras(data.train_dataset.cameras, "cpu") + to_cameras(data.eval_dataset.cameras, "cpu")
+    theirs, ours = (torch.stack([camera.viewmat.double() for camera in some]) for some in (stated, captured))
     centers = [torch.linalg.inv(some)[:, :3, 3] for some in (theirs, ours)]
     extent = (centers[0] - centers[0].mean(0)).norm(dim=1).max().clamp(min=1e-9)
     apart, nearest = (torch.cdist(*centers) / extent).min(1)

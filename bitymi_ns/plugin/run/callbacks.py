@@ -46,20 +46,20 @@ class TrainingRun:
     def __init__(self, model: Any, attributes: TrainingCallbackAttributes) -> None:
         trainer: Any = attributes.trainer  # nerfstudio declares another type
         pipeline: Any = attributes.pipeline
-        assert trainer is not None and pipeline is not None and attributes.optimizers is not None
+        optimizers: Any = attributes.optimizers
         self.scene, self.config, self._curve_views = model.scene, model.train_config, model.config.curve_views
         scene, config, curve_points = self.scene, self.config, model.config.curve_points
         self.datamanager: Any = pipeline.datamanager
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
-        self._parameters = attributes.optimizers.parameters
+        self._parameters = optimizers.parameters
         dataset, views, facts = self.datamanager.train_dataset, self.datamanager.train_views, model.facts
         train, extent = dataset.cameras, scene_extent(facts.camera_centers, scene.surfels["means"])
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
         counts = (facts.train_pixels, model.first_surfels, covered_fraction(views))
         data = TrainingData(views, cameras, extent, *counts, exposure_stops(facts.files), facts.files)
-        optimizers, processes = attributes.optimizers.optimizers, trainer.processes
-        self.training = Training(scene, data, optimizers, config, self.total, self._on_resize, warn, processes)
+        processes, groups = trainer.processes, optimizers.optimizers
+        self.training = Training(scene, data, groups, config, self.total, self._on_resize, warn, processes)
         self.combine = self.training.combine
         self.capture = capture_fingerprint(dataset)
         self._random_state: Tensor | None = None

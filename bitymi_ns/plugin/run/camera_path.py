@@ -80,11 +80,11 @@ class CameraPath(BaseModel):
 def read_camera_path(file: Path) -> CameraPath:
     """Read a camera path; warn if its fields of view look like radians."""
     with reading(f"the camera path {file}", InputError, f"{HELP} (--camera-path-filename)"):
-        found = read_json(file)
-    if isinstance(found, dict) and (found.get("seconds") == 0 or found.get("camera_path") == []):
+        content = read_json(file)
+    if isinstance(content, dict) and (content.get("seconds") == 0 or content.get("camera_path") == []):
         fail(f"the camera path {file} has no frames: add a second keyframe, and save it again.")
     try:
-        path = CameraPath.model_validate(found)
+        path = CameraPath.model_validate(content)
     except ValidationError as error:
         where, what = first_problem(error)
         fail(f"the camera path {file} cannot be used: {where + ': ' if where else ''}{what}. {HELP}", error)

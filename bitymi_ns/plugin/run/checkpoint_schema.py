@@ -50,10 +50,10 @@ class Entry:
         return None if value is None else self._part(key, value)
 
     def __getitem__(self, key: object) -> Entry:
-        found = self.get(key)
-        if found is None:
+        entry = self.get(key)
+        if entry is None:
             raise Misfit(f"{self._part(key, None).name} is missing")
-        return found
+        return entry
 
     def _part(self, key: object, value: Any) -> Entry:
         return Entry(value, f"{self.name}.{str(key).removeprefix('_model.')}" if self.name else str(key))
@@ -169,7 +169,8 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
     kind = VIEW_COLORS[scene.view_color]
     view = zip(kind.names, kind.shapes(kind.terms_of(getattr(scene, kind.option))), strict=True)
     geometry = ((name, parameter.shape) for name, parameter in GEOMETRY_PARAMETERS.items())
-    found = {f"{SURFELS}{name}": pipeline[f"{SURFELS}{name}"].tensor(n, *row) for name, row in (*geometry, *view)}
+    shapes = {f"{SURFELS}{name}": shape for name, shape in (*geometry, *view)}
+    parameters = {name: pipeline[name].tensor(n, *shape) for name, shape in shapes.items()}
     names: tuple[str, ...] = ("field_table", "field_w1", "field_w2", "field_w3", "domain")
     if scene.texture != "hash":
         there = pipeline.table().keys()
@@ -195,11 +196,11 @@ def _parameters(pipeline: Entry, scene: SceneConfig) -> dict[str, Tensor]:
             field[name].tensor(count)
         if bool((sides < 0).any()) or int(sides.prod(1).double().sum()) != count:
             raise Misfit(f"{field['size'].name} does not add up to the {count} rows of {field['texels'].name}")
-    found.update({f"{SCENE}field.{name}": entry.value for name, entry in field.items()})
-    unknown = [name for name in pipeline.table() if str(name).startswith(SCENE) and name not in found]
+    parameters.update({f"{SCENE}field.{name}": entry.value for name, entry in field.items()})
+    unknown = [name for name in pipeline.table() if str(name).startswith(SCENE) and name not in parameters]
     if unknown:
         raise Misfit(f"pipeline.{str(unknown[0]).removeprefix('_model.')} belongs to no scene of this preset")
-    return found
+    return parameters
 
 
 def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
@@ -209,21 +210,21 @@ def check_optimizer(optimizer: Entry, parameters: Sequence[Tensor]) -> None:
         groups.refuse("a list of one group")
     group = Entry(groups.value[0], f"{groups.name}.0")
     numbers = group["params"].value
-    plain = isinstance(numbers, list) and all(isinstance(each, int) for each in numbers)  # tensors compare otherwise
+    plain = isinstance(numbers, list) and all(isinstance(number, int) for number in numbers)  # not tensors
     if not plain or numbers != list(range(len(parameters))):
         group["params"].refuse(f"the numbers of {len(parameters)} parameters")
     group["lr"].number(0.0, MOST)
     for number, value in optimizer["state"].table().items():
-        each = Entry(value, f"{optimizer.name}.state.{number}")
+        entry = Entry(value, f"{optimizer.name}.state.{number}")
         if not isinstance(number, int) or not 0 <= number < len(parameters):
-            raise Misfit(f"{each.name} belongs to no parameter")
+            raise Misfit(f"{entry.name} belongs to no parameter")
         for name in ("exp_avg", "exp_avg_sq"):
-            each[name].tensor(*parameters[number].shape)
-        steps = each["step"]  # a plain number in sparse optimisers
+            entry[name].tensor(*parameters[number].shape)
+        steps = entry["step"]  # a plain number in sparse optimisers
         steps.tensor() if isinstance(steps.value, Tensor) else steps.count()
-        unknown = sorted(map(str, each.table().keys() - {"step", "exp_avg", "exp_avg_sq"}))
+        unknown = sorted(map(str, entry.table().keys() - {"step", "exp_avg", "exp_avg_sq"}))
         if unknown:
-            raise Misfit(f"{each.name}.{unknown[0]} is nothing that this optimiser knows")
+            raise Misfit(f"{entry.name}.{unknown[0]} is nothing that this optimiser knows")
 
 
 def restore_optimizer(optimizer: Optimizer, saved: Entry) -> None:

@@ -74,8 +74,8 @@ def load(path: Path, scene: SceneConfig) -> dict[str, Any]:
         fail(f"{path} is a folder: give one of the files step-*.ckpt with --load-checkpoint, or --load-dir")
     if not path.is_file():
         fail(f"there is no checkpoint {path}")
-    others = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)
-    way_out = f"Remove it to go back to {others[-1]}" if others else "Copy it again from where it was, or train again"
+    earlier = sorted(p.name for p in path.parent.glob("step-*.ckpt") if p != path)
+    way_out = f"Remove it to go back to {earlier[-1]}" if earlier else "Copy it again from where it was, or train again"
 
     advice = f"It is damaged (cut off or altered), or another program wrote it. {way_out}."
     with reading(f"the checkpoint {path}", InputError, "Have it made readable for you (chmod u+r), or copy it."):

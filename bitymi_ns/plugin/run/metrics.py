@@ -30,12 +30,12 @@ def image_metrics(
     result = _similarity(image, reference, mask, tuple(LPIPS))
     if (found := flip(image, reference)) is not None:
         result["flip"] = found
-    others = {"fitted": color_fitted(image, reference, mask)}
+    images = {"fitted": color_fitted(image, reference, mask)}
     if mean_exposure is not None:
-        others["mean_exposure"] = mean_exposure.detach().float().clamp(0.0, 1.0)
-    for name, other in others.items():
-        other = other if mask is None else other * mask
-        result |= {f"{name}_{k}": v for k, v in _similarity(other, reference, mask, ("lpips",)).items()}
+        images["mean_exposure"] = mean_exposure.detach().float().clamp(0.0, 1.0)
+    for name, variant in images.items():
+        variant = variant if mask is None else variant * mask
+        result |= {f"{name}_{k}": v for k, v in _similarity(variant, reference, mask, ("lpips",)).items()}
     return result
 
 

@@ -65,7 +65,8 @@ def run(config: TrainerConfig) -> NoReturn:
             torchrun([*words, "--no-python", *python_command(__name__, "work"), scratch])
         except ChildFailedError as error:
             soon = error.get_first_failure()[1].timestamp + 1  # torchrun ended later ones
-            end({rank: each.exitcode for rank, each in error.failures.items() if each.timestamp <= soon}, count)
+            first = {rank: failure.exitcode for rank, failure in error.failures.items() if failure.timestamp <= soon}
+            end(first, count)
         except (KeyboardInterrupt, SignalException):
             sys.exit(INTERRUPTED)
     sys.exit()

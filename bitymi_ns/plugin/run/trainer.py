@@ -210,9 +210,9 @@ class BitymiTrainer(Trainer):
         }
         checkpoints.save(state, path, self.base_dir, self.config.pipeline.model.scene)
         if self.config.save_only_latest_checkpoint:
-            for other in self.checkpoint_dir.glob("step-*.ckpt"):
-                if other.name < path.name:  # later ones are of another branch
-                    other.unlink(missing_ok=True)
+            for earlier in self.checkpoint_dir.glob("step-*.ckpt"):
+                if earlier.name < path.name:  # later ones are of another branch
+                    earlier.unlink(missing_ok=True)
 
 
 class BitymiPipeline(VanillaPipeline):
@@ -241,9 +241,9 @@ class BitymiPipeline(VanillaPipeline):
         warn_of_other_capture(state.get("capture"), capture_fingerprint(self.datamanager.train_dataset))
         if (poses := state.get("poses")) is not None and poses["motions"] is not None:
             self.model.carry = self.datamanager.move_cameras(poses["motions"])
-        _, found = self.datamanager.corrections(state.get("exposure"))
-        if any(correction is not None for correction in found):
-            self.model.corrections = list(zip(held_out, found, strict=True))
+        _, corrections = self.datamanager.corrections(state.get("exposure"))
+        if any(correction is not None for correction in corrections):
+            self.model.corrections = list(zip(held_out, corrections, strict=True))
 
     def get_average_image_metrics(self, data_loader: Any, *args: Any, **kwargs: Any) -> dict[str, float]:
         """Average the metrics over the images, leaving out those that are NaN, as JSON has no NaN; the deviation of a

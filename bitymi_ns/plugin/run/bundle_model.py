@@ -53,13 +53,16 @@ class BakedModel(SurfelModel):
         folder, renderer = Path(self.config.bundle), os.environ.get(RENDERER) or self.config.renderer
         if renderer not in ("kernels", "fast", "webgpu"):
             fail(f"{RENDERER} must be kernels, fast or webgpu, not {renderer!r}")
+        crop = os.environ.get(CROP) or str(self.config.crop)
+        if crop.lower() not in ("true", "false"):
+            fail(f"{CROP} must be True or False, not {crop!r}")
         through_webgpu = renderer == "webgpu"
         if through_webgpu:
             with _webgpu_needed():
                 webgpu.device.device()
         on_card = kernel_device(self.kwargs.get("device", "cpu")).type == "cuda" and not through_webgpu
         try:
-            bundle = read_bundle(folder, decode=not on_card, crop=self._crops())
+            bundle = read_bundle(folder, decode=not on_card, crop=crop.lower() == "true")
         except BundleError as error:
             fail(f"{error}." if isinstance(error, NotesError) else f"{error}. {REMEDY}", error)
         atlas = bundle.info.atlas
@@ -74,12 +77,6 @@ class BakedModel(SurfelModel):
         self._scene = bundle.scene
         self._renderer = self._new_renderer(None)
         self.corrections = [(row.camera, row.exposure) for row in bundle.cameras if row.correction is not None]
-
-    def _crops(self) -> bool:
-        asked = os.environ.get(CROP) or str(self.config.crop)
-        if asked.lower() not in ("true", "false"):
-            fail(f"{CROP} must be True or False, not {asked!r}")
-        return asked.lower() == "true"
 
     def crop_to(self, box: OrientedBox | None) -> None:
         wanted = box_of(box)

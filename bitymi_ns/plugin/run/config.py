@@ -117,9 +117,7 @@ class BitymiTrainerConfig(TrainerConfig):
         checkpoints.check_removed("the configuration", vars(model.scene), vars(model.train.lr))
         for name in ("mixed_precision", "use_grad_scaler"):
             if getattr(self, name):
-                fail(
-                    f"--{name.replace('_', '-')} True scales the gradients by which surfels are densified: leave it out"
-                )
+                fail(f"--{name.replace('_', '-')} True scales the gradients that densify surfels: leave it out")
         for group, steps in self.gradient_accumulation_steps.items():
             if steps < 1 or group not in PARAMETER_GROUPS:
                 known = ", ".join(PARAMETER_GROUPS)
@@ -148,17 +146,10 @@ class BitymiTrainerConfig(TrainerConfig):
             write_file(folder / "config.yml", yaml.dump(recorded).encode("utf8"))
         # else nerfstudio would start the processes its own way
         self.machine = replace(self.machine, num_machines=1, num_devices=1)
-        say(self.summary())
-
-    def summary(self) -> str:
         resumed = self.load_dir or self.load_checkpoint
-        lines = {
-            "method": self.method_name,
-            "capture": self.pipeline.datamanager.data,
-            "length": self.length() if resumed is None else f"goes on from {resumed}",
-            "output": f"{self.get_base_dir()} (every option is in its config.yml)",
-        }
-        return "\n".join(f"{name:8} {value}" for name, value in lines.items())
+        say(f"method   {self.method_name}\ncapture  {self.pipeline.datamanager.data}")
+        say(f"length   {self.length() if resumed is None else f'goes on from {resumed}'}")
+        say(f"output   {folder} (every option is in its config.yml)")
 
     def resolve_length(self, trained_for: int | None = None) -> None:
         """Set run length and save interval if not given; `trained_for`: length of the resumed run."""
@@ -188,7 +179,7 @@ class BitymiTrainerConfig(TrainerConfig):
             datamanager.data = getattr(datamanager.dataparser, "data", None)
         for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
             path = getattr(owner, "data", None)
-            if owner is not None and path is not None:
+            if path is not None:
                 owner.data = Path(os.path.expanduser(path)).absolute()
         if isinstance(datamanager.dataparser, BitymiDataParserConfig):
             datamanager.dataparser.resolve_names()

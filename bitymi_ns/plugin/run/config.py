@@ -179,7 +179,7 @@ class BitymiTrainerConfig(TrainerConfig):
             datamanager.data = getattr(datamanager.dataparser, "data", None)
         for owner in (self, datamanager, getattr(datamanager, "dataparser", None)):
             path = getattr(owner, "data", None)
-            if path is not None:
+            if owner is not None and path is not None:
                 owner.data = Path(os.path.expanduser(path)).absolute()
         if isinstance(datamanager.dataparser, BitymiDataParserConfig):
             datamanager.dataparser.resolve_names()

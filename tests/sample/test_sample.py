@@ -152,13 +152,6 @@ def test_bad_sizes(tmp_path: Path, bad: dict) -> None:
 
 @pytest.mark.slow
 def test_interrupted_stops_soon_and_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full_disk(*args: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
-        patch.setattr("bitymi_ns.sample.capture.write_cloud", full_disk)
-        generate(tmp_path / "room", views=1, width=16, height=12)
-    assert not list(tmp_path.iterdir())
     calls = []
 
     def interrupted(*args: object) -> None:

@@ -10,13 +10,9 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 
-@pytest.fixture
-def script(load: Callable[[str], ModuleType]) -> ModuleType:
-    return load("test_environment")
-
-
 @pytest.mark.parametrize("end", ["oldest", "newest"])
-def test_requirements_admit_the_versions_found(load: Callable[[str], ModuleType], script: ModuleType, end: str) -> None:
+def test_requirements_admit_the_versions_found(load: Callable[[str], ModuleType], end: str) -> None:
+    script = load("test_environment")
     head, *lines = (script.FOUND / f"{end}.txt").read_text("utf8").splitlines()
     python = re.match(r"# Python ((\d+\.\d+)\.\d+)", head)
     assert python[2] == script.ENDS[end][0]
@@ -29,8 +25,9 @@ def test_requirements_admit_the_versions_found(load: Callable[[str], ModuleType]
 
 
 def test_a_python_that_is_not_there_or_does_not_run_is_named(
-    script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    load: Callable[[str], ModuleType], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    script = load("test_environment")
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr("sys.argv", ["test_environment.py", "--work", str(tmp_path)])
     with pytest.raises(SystemExit, match=r"No 'python3\.10' found on PATH"):

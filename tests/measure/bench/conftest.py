@@ -1,7 +1,6 @@
 """Stubs of nerfstudio's console scripts, which write what the real ones would and keep a log."""
 
 import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -77,17 +76,6 @@ class Fakes:
     def fail(self, *lines: str) -> None:
         """Make calls with all words of one of the lines exit with status 3."""
         self.plan.write_text("\n".join(lines))
-
-    def python(self, monkeypatch: pytest.MonkeyPatch) -> str:
-        """Return a Python that finds the stubs beside it, for other processes."""
-        link = self.folder / "python"
-        link.symlink_to(Path(sys.executable).resolve())
-        started = self.folder / "site"
-        started.mkdir()
-        hooks = [path for path in sys.path if path.endswith("site-packages")]  # with those of an editable installation
-        (started / "sitecustomize.py").write_text(f"import site\nfor path in {hooks}:\n    site.addsitedir(path)\n")
-        monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(started), *filter(None, sys.path)]))
-        return str(link)
 
 
 @pytest.fixture(scope="session")

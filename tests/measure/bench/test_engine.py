@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -75,11 +76,10 @@ def test_a_kill_costs_one_cell(
 
 
 @pytest.mark.slow
-def test_a_killed_benchmark_goes_on_when_its_command_has_ended(
-    fakes, matrix: list[Chain], work: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    python = fakes.python(monkeypatch)
-    words = [python, "-m", "bitymi_ns", "bench", "local", "--data", matrix[0][0].data, "--steps", "10"]
+def test_a_killed_benchmark_goes_on_when_its_command_has_ended(fakes, matrix: list[Chain], work: Path) -> None:
+    beside = f"import sys; sys.executable = {str(fakes.folder / 'python')!r}"  # where the stubs are found
+    code = f"{beside}; from bitymi_ns.cli import main; sys.exit(main())"
+    words = [sys.executable, "-c", code, "bench", "local", "--data", matrix[0][0].data, "--steps", "10"]
     words += ["--formats", "bc7", "--work", str(work)]
     fakes.slow.write_text("ns-export")
     process = subprocess.Popen(words, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)

@@ -15,8 +15,7 @@ from bitymi_ns.safe_reading import open_regular
 from tests.changes import SPOILT
 from tests.measure.report.conftest import cell, figures, write_lines
 
-PLOTS = 12
-"""Plots of three metrics against three costs, and of training curves."""
+PLOTS = 12  # of three metrics against three costs, and of training curves
 
 
 def check_nesting(page: str) -> None:

@@ -164,8 +164,8 @@ def tables() -> str:
         },
         "TERM_LIMITS": terms,
         "SHAPES": {
-            name: {"at": min(at, default=0), "limits": [of_width(limit_of("view_terms", name), 9)[i] for i in at]}
-            for name, at in shapes.items()
+            name: {"at": min(rows, default=0), "limits": [of_width(limit_of("view_terms", name), 9)[i] for i in rows]}
+            for name, rows in shapes.items()
         },
         "WHOLE": whole,
         "LIMITS": stored,

@@ -252,7 +252,7 @@ def cells(uv: Tensor) -> Tensor:
     """Find the cell between texel centres, where the slope of the bilinear fetch is constant, of coordinates [..., 2]:
     index [...] int64, or -1 if rounding decides it."""
     size = torch.tensor(TILE, dtype=torch.float64, device=uv.device)
-    at = (uv.detach().double().clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # -0.5 to size - 0.5
-    column, row = (at.floor().long() + 1).unbind(-1)
-    decided = ((at - at.round()).abs() > ON_A_TEXEL * size).all(-1)
+    place = (uv.detach().double().clamp(-SUPPORT, SUPPORT) + SUPPORT) / (2 * SUPPORT) * size - 0.5  # -0.5 to size - 0.5
+    column, row = (place.floor().long() + 1).unbind(-1)
+    decided = ((place - place.round()).abs() > ON_A_TEXEL * size).all(-1)
     return torch.where(decided, column + (TILE[0] + 1) * row, -1)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from bitymi_ns.scene.scene import Scene
 
 TOGETHER = 4  # steps whose losses are copied to the host together
+Label = tuple[int, str]  # step and loss term
 
 
 class LossWatch:
@@ -20,16 +21,16 @@ class LossWatch:
     asynchronously and checked a few steps later."""
 
     def __init__(self) -> None:
-        self._pending: list[tuple[int, tuple[str, ...], list[Tensor]]] = []
-        self._in_flight: deque[tuple[list[tuple[int, tuple[str, ...]]], Tensor, torch.cuda.Event]] = deque()
+        self._pending: list[tuple[list[Label], list[Tensor]]] = []
+        self._in_flight: deque[tuple[list[Label], Tensor, torch.cuda.Event]] = deque()
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
         """Check the loss terms of a step. Raises TrainingDiverged: one of this or an earlier step is not finite."""
-        names, values = tuple(terms), [term.detach() for term in terms.values()]
+        labels, values = [(step, name) for name in terms], [term.detach() for term in terms.values()]
         if values[0].device.type != "cuda":
-            self._check(scene, [(step, names)], torch.stack(values))
+            self._check(scene, labels, torch.stack(values))
             return
-        self._pending.append((step, names, values))
+        self._pending.append((labels, values))
         if len(self._pending) >= TOGETHER:
             self._send()
         while self._in_flight and self._in_flight[0][2].query():
@@ -38,12 +39,12 @@ class LossWatch:
     def _send(self) -> None:
         if not self._pending:
             return
-        values = torch.stack([value for _, _, values in self._pending for value in values])
+        values = torch.stack([value for _, values in self._pending for value in values])
         arrived = torch.empty(values.shape, dtype=values.dtype, pin_memory=True)
         arrived.copy_(values, non_blocking=True)
         event = torch.cuda.Event()
         event.record(torch.cuda.current_stream(values.device))
-        self._in_flight.append(([(step, names) for step, names, _ in self._pending], arrived, event))
+        self._in_flight.append(([label for labels, _ in self._pending for label in labels], arrived, event))
         self._pending = []
 
     def finish(self, scene: Scene) -> None:
@@ -59,9 +60,8 @@ class LossWatch:
         self._pending.clear()
 
     @staticmethod
-    def _check(scene: Scene, steps: list[tuple[int, tuple[str, ...]]], values: Tensor) -> None:
-        terms_of_steps = [(step, name) for step, names in steps for name in names]
-        for (step, name), value in zip(terms_of_steps, values.tolist(), strict=True):
+    def _check(scene: Scene, labels: list[Label], values: Tensor) -> None:
+        for (step, name), value in zip(labels, values.tolist(), strict=True):
             if not math.isfinite(value):
                 cause = describe_broken(scene) or "all parameters are finite; look for NaN in the images and cameras"
                 raise TrainingDiverged(f"the {name} loss is {value} at step {step}: {cause}")

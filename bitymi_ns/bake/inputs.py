@@ -32,7 +32,6 @@ class BakeInput:
 
     def of(self, rows: Tensor) -> BakeInput:
         surfels = {name: value[rows] for name, value in self.surfels.items()}
-        rows = torch.nonzero(rows).squeeze(1) if rows.dtype == torch.bool else rows
         alpha, views = (None if part is None else part.of(rows) for part in (self.alpha, self.views))
         return replace(self, surfels=surfels, alpha=alpha, views=views)
 

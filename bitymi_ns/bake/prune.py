@@ -49,8 +49,9 @@ def drop_unseen(
         views = visibility(surfels, moved, scene.near, scene.weight_bound, progress, alpha)
     inputs = BakeInput(surfels, moved, scene.near, scene.weight_bound, views, alpha)
     if views is not None and baked.options.drop_unseen:
-        seen = views.transmittance > 0
-        inputs, rows, gone["unseen"] = inputs.of(seen), rows[seen.cpu()], int((~seen).sum())
+        seen = torch.nonzero(views.transmittance > 0).squeeze(1)
+        gone["unseen"] = len(rows) - len(seen)
+        inputs, rows = inputs.of(seen), rows[seen.to(rows.device)]
     if len(rows) == 0:
         raise ValueError("no surfel is left to bake")
     kept = torch.zeros(len(baked.rows), dtype=torch.bool)

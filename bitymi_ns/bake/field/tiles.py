@@ -7,11 +7,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.inputs import BakeInput
-from bitymi_ns.bake.prune import drop_unseen
-from bitymi_ns.bake.stages import Trained
-from bitymi_ns.bake.tile_errors import closest_pixels
-from bitymi_ns.bake.tiles import Tiles, grid
 from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.codec.pages import listed_tiles
 from bitymi_ns.progress import Progress, no_progress
@@ -24,6 +19,11 @@ from bitymi_ns.scene.tile_sizes import (
     voxel_along_axes,
 )
 from bitymi_ns.train.init import tangents
+from ..inputs import BakeInput
+from ..prune import drop_unseen
+from ..stages import Trained
+from ..tile_errors import closest_pixels
+from ..tiles import Tiles, grid
 
 PAPER_EXTENT = 4.0  # e of the paper's rule
 

@@ -8,10 +8,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from bitymi_ns.bake.early_stopping import FEWEST_VIEWS, EarlyStopping, evaluate, gain, validation_split
-from bitymi_ns.bake.stages import Trained
-from bitymi_ns.bake.tune import TuneOptions
-from bitymi_ns.bake.tuning_views import TexelList
 from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.progress import Progress, no_progress
@@ -23,6 +19,10 @@ from bitymi_ns.train.config import DensifyConfig, GuardConfig, LossConfig, Texel
 from bitymi_ns.train.divergence import TrainingDiverged
 from bitymi_ns.train.fit import Trainer
 from bitymi_ns.train.views import View
+from ..early_stopping import FEWEST_VIEWS, EarlyStopping, evaluate, gain, validation_split
+from ..stages import Trained
+from ..tune import TuneOptions
+from ..tuning_views import TexelList
 
 MEANS = (1.6e-4, 1.6e-6)
 """First and last learning rates of positions, in scene extents."""

@@ -93,7 +93,8 @@ class Coder:
     ) -> None:
         """Measure `baked` in the training views; without any the reference steps are taken. Alternatives are stated on
         the `held_out` views, or without any on the training views. `background`: [3]."""
-        self._baked, self._pictures = baked, Pictures(views, background, options.views, baked.device)
+        self._baked = baked
+        self._pictures = Pictures(views, background, options.views, baked.device)
         self._held_out = Pictures(held_out, background, options.views, baked.device)
         scene = baked.unquantised()
         self._sizes = baked.sizes.long()
@@ -106,7 +107,8 @@ class Coder:
         self._tiles, self._coverage = None, baked.texels.new_zeros(len(baked.texels), 2)
         if baked.textured:
             texels = TexelList(baked)
-            self._tiles, self._coverage = texels.tiles, texels.coverage(views, progress).cpu()
+            self._tiles = texels.tiles
+            self._coverage = texels.coverage(views, progress).cpu()
 
     @property
     def measured(self) -> bool:
@@ -123,7 +125,8 @@ class Coder:
     def at(self, lmbda: float, held_out: bool = False) -> RatePoint:
         """Round and code everything at a lambda: squared error per bit, summed over pixels and channels of all views.
         `held_out`: error and PSNR are of the held-out views, if there are any."""
-        baked, pictures = self._baked, self._held_out if held_out and self._held_out.views else self._pictures
+        baked = self._baked
+        pictures = self._held_out if held_out and self._held_out.views else self._pictures
         surfels = {**baked.scene.surfels, **self._view_colors(lmbda)}
         steps = self._noise.steps(lmbda / self._numbers if self.measured else 0.0)
         codes, order = code_surfels(surfels, baked.scene.view_color, self._sizes, baked.extent, steps)

@@ -25,7 +25,9 @@ class EarlyStopping(Generic[S]):
         the end. `psnr`: dB before the first step; NaN without views. `first`: state then."""
         self._steps, self._patience = steps, patience
         self._every = max(1, -(-steps // checks))
-        self.best, self.curve, self.done = first, [] if math.isnan(psnr) else [(0, psnr)], 0
+        self.best = first
+        self.curve = [] if math.isnan(psnr) else [(0, psnr)]
+        self.done = 0
 
     def due(self, done: int) -> bool:
         return done % self._every == 0 or done == self._steps

@@ -124,7 +124,9 @@ def bake(
         raise ValueError(f"{listed(given)} are for a field: tiles that were trained get smaller by the tolerance")
     form = "compact" if refine.compact is not None else options.format
     options = replace(options, format=replace(options, format=form).texel_format)  # as bundle.json states it
-    polish, tune, trained = refine.polish, refine.tune, trained_texels(scene, options)
+    polish = refine.polish
+    tune = refine.tune
+    trained = trained_texels(scene, options)
     if scene.field is not None and not isinstance(scene.field, TexelField):
         trained = field_tiles(trained, scene.field, cameras, polish and polish.pixels_per_texel, progress)
     if polish is not None and trained.textured:

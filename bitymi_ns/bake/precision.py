@@ -80,7 +80,8 @@ def column_noise(
     codes, order = code_surfels(scene.surfels, scene.view_color, sizes, extent, REFERENCE)
     moved = {name: getattr(scene, name) for name in ("tiles", "extent", "mean_residual", "mean_alpha")}
     moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}
-    plain, drawn = replace(scene, surfels=reordered(scene.surfels, order), **moved), pictures.of(scene)
+    plain = replace(scene, surfels=reordered(scene.surfels, order), **moved)
+    drawn = pictures.of(scene)
     rounded, tiled = codes.surfels(), torch.from_numpy(codes.sizes[:, 0] > 0)
     extent = torch.where(tiled, codes.extent(1.0), extent[order])
     noise, counts = {}, {}
@@ -90,8 +91,9 @@ def column_noise(
         if name == "extent":
             changed = replace(plain, extent=extent)
         elif name in ("term_shape", "term_color"):
-            at, terms = term_numbers(codes.kind)[name == "term_shape"], plain.surfels["view_terms"].clone()
-            terms[:, at] = rounded["view_terms"][:, at]
+            numbers = term_numbers(codes.kind)[name == "term_shape"]
+            terms = plain.surfels["view_terms"].clone()
+            terms[:, numbers] = rounded["view_terms"][:, numbers]
             changed = replace(plain, surfels={**plain.surfels, "view_terms": terms})
         else:
             parameter = CODED.get(name, name)

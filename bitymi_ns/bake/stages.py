@@ -164,7 +164,8 @@ class Rounded(Stage):
         colors = self.texels[:, :3].contiguous()
         if not self.textured:
             return _coded(self, colors, codes=self._codes(None, residual_codes(colors), RESIDUAL_STEP))
-        coder, most = TexelCoder(self.sizes, torch.ones(len(colors)), self.step, self.alpha_codes), self.most_bytes
+        coder = TexelCoder(self.sizes, torch.ones(len(colors)), self.step, self.alpha_codes)
+        most = self.most_bytes
         return self.coded(coder.code(colors) if most is None else coder.fit(colors, most), colors)
 
     def coded(self, texels: TexelCodes, colors: Tensor) -> Coded:

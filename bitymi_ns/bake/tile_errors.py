@@ -69,7 +69,8 @@ def moving_average(values: Tensor, cells: Tensor) -> Tensor:
 
 def _windows(count: int, width: Tensor) -> Tensor:
     """Build matrices [n, count, count] of a moving average with windows of `width` [n] cells."""
-    edge, half = torch.arange(count, device=width.device, dtype=torch.float32), width[:, None] / 2
+    edge = torch.arange(count, device=width.device, dtype=torch.float32)
+    half = width[:, None] / 2
     center = torch.minimum(torch.maximum(edge + 0.5, half), count - half)  # [n, count]
     low, high = (center - half)[:, :, None], (center + half)[:, :, None]
     return (torch.minimum(high, edge + 1) - torch.maximum(low, edge)).clamp(min=0) / width[:, None, None]

@@ -116,7 +116,8 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     fine, constant = tiles.texels.to(device), tiles.texels[first_texels(tiles.sizes)]
     sizes = torch.zeros(len(tiles.sizes), 2, dtype=torch.int32)
     for size, rows, index in listed_tiles(tiles.sizes.to(device), options.chunk):
-        values, weight = fine[index].permute(0, 3, 1, 2).contiguous(), weights(shown, rows, size)
+        values = fine[index].permute(0, 3, 1, 2).contiguous()
+        weight = weights(shown, rows, size)
         square = weight.square()[:, None]
         mean = (values * square).sum((2, 3)) / square.sum((2, 3)).clamp(min=1e-12)  # the nearest constant
         flat = weighted_rms(values - mean[:, :, None, None], weight) <= options.tolerance

@@ -152,13 +152,15 @@ def tune_atlas(
     before = validation.psnr(texels.values, progress)  # first, to fill the cache
     stopping = EarlyStopping(options.steps, options.checks, options.patience, before, texels.values)
     if isinstance(baked, Rounded):
-        covered, coder = baked.coverage.to(baked.device), Cosines(baked, baked.coverage[:, 1])
+        covered = baked.coverage.to(baked.device)
+        coder = Cosines(baked, baked.coverage[:, 1])
     else:
         covered, coder = texels.coverage(trained, progress), Pages(baked)
     step_size = 1.0 / (covered[:, 0] + options.prior)  # [T]
     moved = texels.values.clone()
     for step in range(options.steps):
-        view, rate = training_order(len(tuned), options.seed, step), falling(options.rate, step, options.steps)
+        view = training_order(len(tuned), options.seed, step)
+        rate = falling(options.rate, step, options.steps)
         tuned.step(view, moved, step_size, rate, options.ssim_weight)
         progress("tuning texels", step + 1, options.steps)
         if stopping.due(step + 1) and not stopping.update(step + 1, validation.psnr(moved), moved.clone):

@@ -82,7 +82,9 @@ class TuningViews(Sequence[TuningView]):
     """Views of a bake, traced at first use and kept while there is budget for them."""
 
     def __init__(self, texels: TexelList, views: Sequence[View], background: Tensor, budget: MemoryBudget) -> None:
-        self._texels, self._views, self._budget = texels, views, budget
+        self._texels = texels
+        self._views = views
+        self._budget = budget
         self._background = background.to(texels.device)
         self._kept: dict[int, TuningView] = {}
         self._keeps: bool | None = None  # whether any; None before the first

@@ -106,13 +106,16 @@ def color_choices(
     means, entry = surfels["means"], VIEW_COLORS[kind]
     most = entry.terms(surfels) - entry.base_terms
     error = means.new_full((len(means), most + 1), torch.inf)
-    largest, choices, done = means.new_zeros(len(means)), [], 0
+    largest = means.new_zeros(len(means))
+    choices = []
+    done = 0
     for chunk in view_directions(means, squares > 0, centers):
         own = [surfels[name][chunk.rows] for name in entry.names]
         shown = squares[:, chunk.rows].float()
         unseen, of_unseen = _unseen(means[chunk.rows], shown, centers, near)
         weight = torch.cat([_weights(chunk, shown), of_unseen], dim=1)
-        unit, valid = torch.cat([chunk.unit, unseen], dim=1), F.pad(chunk.valid, (0, unseen.shape[1]))
+        unit = torch.cat([chunk.unit, unseen], dim=1)
+        valid = F.pad(chunk.valid, (0, unseen.shape[1]))
         chunk = replace(chunk, unit=unit, valid=valid)
         target = shown_at(kind, dict(zip(entry.names, own, strict=True)), chunk.unit)
 

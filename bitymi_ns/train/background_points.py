@@ -101,7 +101,8 @@ class _Grid(NamedTuple):
 
     def _index(self, x: Tensor, y: Tensor) -> Tensor:
         rows, columns = self.nearest.shape
-        row, column = (y / self.height).long().clamp(max=rows - 1), (x / self.width).long().clamp(max=columns - 1)
+        row = (y / self.height).long().clamp(max=rows - 1)
+        column = (x / self.width).long().clamp(max=columns - 1)
         return row * columns + column
 
     def at(self, x: Tensor, y: Tensor) -> Tensor:

@@ -26,7 +26,8 @@ class LossWatch:
 
     def note(self, scene: Scene, step: int, terms: dict[str, Tensor]) -> None:
         """Check the loss terms of a step. Raises TrainingDiverged: one of this or an earlier step is not finite."""
-        labels, values = [(step, name) for name in terms], [term.detach() for term in terms.values()]
+        labels = [(step, name) for name in terms]
+        values = [term.detach() for term in terms.values()]
         if values[0].device.type != "cuda":
             self._check(scene, labels, torch.stack(values))
             return

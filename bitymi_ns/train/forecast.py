@@ -81,7 +81,9 @@ class Forecast:
         for step, count in evaluated.items():
             at_full_size[step] += DRAWN * count
         self._of_step, self._at_full_size = of_step, at_full_size
-        self._sizes, self._pixels, self._surfels = sizes, pixels, surfels
+        self._sizes = sizes
+        self._pixels = pixels
+        self._surfels = surfels
         self._measured, self._times = np.zeros(1), np.ones(1)  # logarithms of sizes, relative times of a unit
         self._beside = 0.0  # units that a step costs beside its views
         self._begin, self._warm = (0.0, 0.0), first + WARM
@@ -115,7 +117,9 @@ class Forecast:
         beside = max(0.0, self._cpu / self._steps - seconds[self._sizes[step]])
         units = sizes**2 * self._pixels + SURFEL * self._surfels[step]
         times = np.array([seconds[size] for size in sizes]) / units
-        self._measured, self._times, self._beside = np.log(sizes), times / times[-1], beside / times[-1]
+        self._measured = np.log(sizes)
+        self._times = times / times[-1]
+        self._beside = beside / times[-1]
         before = self._units[step]
         self._plan()
         self._done *= self._units[step] / before
@@ -141,7 +145,9 @@ class Forecast:
 
     def half(self) -> float:
         """Compute the factor of the pictures' sides at which the whole run takes half as long; 0 if none does."""
-        low, high, wanted = 0.0, 1.0, 0.5 * self._units.sum()
+        low = 0.0
+        high = 1.0
+        wanted = 0.5 * self._units.sum()
         for _ in range(20):
             middle = 0.5 * (low + high)
             low, high = (middle, high) if self._cost(middle).sum() <= wanted else (low, middle)

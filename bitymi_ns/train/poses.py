@@ -231,7 +231,10 @@ def aligned(scene: Scene, view: View, background: Tensor | None, ssim_weight: fl
         candidate = moved(best, pose_step(*slope, pixels))
         loss, *candidate_slope = judge(candidate)
         if loss < least:
-            best, least, slope, pixels = candidate, loss, candidate_slope, 1.5 * pixels
+            best = candidate
+            least = loss
+            slope = candidate_slope
+            pixels = 1.5 * pixels
         else:
             pixels *= 0.4
     return view.camera.posed(best)

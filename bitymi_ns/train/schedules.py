@@ -46,7 +46,9 @@ class Schedule:
             raise ValueError(f"a run needs at least one step, not {max_steps}")
         if not (math.isfinite(extent) and extent > 0.0):
             raise ValueError(f"the scene extent must be positive and finite, not {extent}")
-        self.config, self.max_steps, self.extent = config, max_steps, float(extent)
+        self.config = config
+        self.max_steps = max_steps
+        self.extent = float(extent)
         check_ranges(config)
         self._texels, self.pixels = texels, pixels
         self.in_pixels = config.lr.means is None

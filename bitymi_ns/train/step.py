@@ -146,7 +146,9 @@ class Training:
         Raises:
             ValueError: a training option is out of its range.
         """
-        self.scene, self.optimizers, self.processes = scene, optimizers, processes
+        self.scene = scene
+        self.optimizers = optimizers
+        self.processes = processes
         textured = scene.config.texture == "texels"
         pixels = data.covered * data.image_pixels / max(1, len(data.views))
         self.schedule = Schedule(config, max_steps, data.extent, textured, pixels)
@@ -257,7 +259,9 @@ class Training:
     def finish(self) -> dict[str, float]:
         """After the optimisers, densify, prune, check for divergence and stop the clock. Returns numbers by action
         (pruned, rolled_back, ...). Raises TrainingDiverged: see `RollbackGuard.repair`."""
-        step, projections, photometric = self.step, self._projections, self._photometric
+        step = self.step
+        projections = self._projections
+        photometric = self._photometric
         assert projections, "a step is finished after its losses"
         self._projections, self._photometric = [], []
         self.exposure.step(self.guard.factor * self.schedule.lr("exposure", step), self.processes)

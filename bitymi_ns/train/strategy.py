@@ -71,7 +71,10 @@ class Strategy:
             image_pixels: total over all training images at full size; 0: no limit on surfels.
             first_surfels: initial number of surfels.
         """
-        self.scene, self.optimizers, self.processes, self.on_resize = scene, optimizers, processes, on_resize
+        self.scene = scene
+        self.optimizers = optimizers
+        self.processes = processes
+        self.on_resize = on_resize
         self.schedule, self.config = schedule, schedule.config
         self.most = self._most = most_surfels(self.config, image_pixels, first_surfels)
         self.most_by_memory = 0

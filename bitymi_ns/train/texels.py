@@ -46,7 +46,10 @@ class LearningTexels:
     """Optimisation of the texels in the texel stage."""
 
     def __init__(self, scene: Scene, schedule: Schedule, processes: Processes) -> None:
-        self.scene, self.schedule, self.options, self.processes = scene, schedule, schedule.config.texels, processes
+        self.scene = scene
+        self.schedule = schedule
+        self.options = schedule.config.texels
+        self.processes = processes
         self._rates: list[RemovableHandle] = []
         self._views = 1
         self.most_by_memory = 0  # texels to which memory has limited the tiles; 0: it has not

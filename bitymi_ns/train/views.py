@@ -270,7 +270,9 @@ class DownscaledViews:
     def _at(self, index: int, factor: float) -> View:
         if factor != self._factor:
             self._reduced_budget.left += sum(view.nbytes for view in self._kept.values())
-            self._factor, self._kept, self._counted = factor, {}, {}
+            self._factor = factor
+            self._kept = {}
+            self._counted = {}
         if index in self._kept:
             return self._kept[index]
         view = self._full_size(index)

@@ -93,7 +93,9 @@ def grids(
     """Choose the finest useful grids: sides [N, 2] int32, (0, 0) = none, and half sides [N], scale units; and texels by
     rule of `KeptTexels`."""
     surfels = inputs.surfels
-    means, scales, axes = surfels["means"], surfels["log_scales"].exp(), tangents(surfels["quats"])
+    means = surfels["means"]
+    scales = surfels["log_scales"].exp()
+    axes = tangents(surfels["quats"])
     opacity, beta = kernel_parameters(surfels, inputs.transmittance)
     extent = torch.full_like(opacity, options.extent)
     if options.tolerance > 0:

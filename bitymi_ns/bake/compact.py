@@ -76,7 +76,7 @@ class RatePoint:
     def bytes(self) -> int:
         if self.texels is not None:
             return self.baked.codes.nbytes() + self.texels.nbytes()
-        return self.baked.codes.nbytes() + len(streams.compress(residual_codes(self.baked.texels)).data)
+        return self.baked.codes.nbytes() + streams.bytes_of([residual_codes(self.baked.texels)])
 
 
 class Coder:

@@ -12,11 +12,11 @@ from torch import Tensor
 from bitymi_ns.ranges import first_problem
 from bitymi_ns.scene.camera import Camera
 from . import strict_json
-from .manifest import BundleError
+from .manifest import BundleError, Side
 
 MOST_CAMERAS = 100_000
 _Number = Annotated[float, Field(ge=-1e9, le=1e9)]
-_Size = Annotated[int, Field(ge=1, le=1 << 20)]
+
 _Length = Annotated[float, Field(gt=0, le=1e9)]
 
 
@@ -35,8 +35,8 @@ class CapturedCamera(BaseModel):
 
     name: str
     held_out: bool
-    width: _Size
-    height: _Size
+    width: Side
+    height: Side
     fx: _Length
     fy: _Length
     cx: _Number

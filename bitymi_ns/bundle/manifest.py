@@ -106,7 +106,7 @@ class ColumnEntry(Part):
 class PositionFrame(Part):
     """Grid of positions, `codec.surfel_codes.PositionGrid`."""
 
-    center: tuple[Coordinate, Coordinate, Coordinate]
+    center: Point
     scale: Annotated[float, Field(gt=0, le=LIMITS["means"][0])]
     low: tuple[Bent, Bent, Bent]
 

@@ -1,7 +1,7 @@
 """Integer columns as bytes, entropy-coded."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -36,6 +36,11 @@ def compress(codes: npt.NDArray[np.integer]) -> Compressed:
     with ThreadPoolExecutor(module.num_threads()) as pool:
         parts = list(pool.map(lambda number, of: module.encode_integers(number, blocks, of), numbers, others))
     return Compressed([len(part) for part in parts], b"".join(parts))
+
+
+def bytes_of(columns: Iterable[npt.NDArray[np.integer]]) -> int:
+    """Count the bytes of compressed columns."""
+    return sum(len(compress(column).data) for column in columns)
 
 
 def decompress(view: memoryview, rows: int, sizes: Sequence[int], blocks: int = 0) -> npt.NDArray[np.int64]:

@@ -78,7 +78,7 @@ class SurfelCodes:
 
     def nbytes(self) -> int:
         """Count the bytes of surfels.bin without residuals."""
-        return sum(len(streams.compress(column).data) for column in self.columns.values())
+        return streams.bytes_of(self.columns.values())
 
     @property
     def sizes(self) -> npt.NDArray[np.int64]:

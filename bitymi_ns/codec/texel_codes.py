@@ -118,10 +118,8 @@ class TexelCodes:
 
     def nbytes(self) -> int:
         """Count the bytes of texels.bin, and of residuals and mean alphas in surfels.bin."""
-        columns = [*self.columns.values(), self.residual]
-        if self.alpha is not None:
-            columns.append(self.alpha.mean[:, None])
-        return sum(len(streams.compress(column).data) for column in columns)
+        means = [] if self.alpha is None else [self.alpha.mean[:, None]]
+        return streams.bytes_of([*self.columns.values(), self.residual, *means])
 
     @property
     def constants(self) -> Tensor:

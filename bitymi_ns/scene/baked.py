@@ -54,11 +54,11 @@ class BakedScene:
         blocks: [layers, height / 4, width / 4, 16] uint8 on the CPU, the same atlas as BC7 blocks, which a CUDA device
             reads; None: not given. The CPU needs `atlas`.
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.
-        extent: [N] half side of the tile in scale units; None: 3 everywhere, the kernel's support.
-        mean_residual: [N, 3] float32 mean residual of each tile, and the residual of surfels without a tile. None: 0.
+        extent: [N] half side of the tile in scale units; None: 3, the kernel's support.
+        mean_residual: [N, 3] float32 mean residual of each tile, or residual without a tile; None: 0.
         alpha_scale: texels multiply their surfel's sigma by m = alpha_scale * value of their fourth channel
             (`ops.TexelAlpha`); 0: opaque texels.
-        mean_alpha: [N] float32 mean m of each tile, and m of surfels without a tile. None: 1.
+        mean_alpha: [N] float32 mean m of each tile, or m without a tile; None: 1.
         near: near plane, camera z.
         weight_bound: fragments of smaller blending weight have no residual.
         transmittance_min: a pixel ends at the surfel, not blended itself, that would leave less transmittance; 0: no

@@ -35,7 +35,6 @@ TYPES = {
     ".css": "text/css; charset=utf-8",
     ".json": "application/json",
     ".ktx2": "image/ktx2",
-    ".ply": "application/octet-stream",
     ".png": "image/png",
     ".jpg": "image/jpeg",
     ".webp": "image/webp",

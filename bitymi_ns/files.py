@@ -137,7 +137,7 @@ def _check_movable(place: Path) -> None:
         try:
             os.close(os.open(place, os.O_WRONLY | os.O_NONBLOCK))
         except OSError as error:
-            if error.errno == errno.EPERM:  # others do not prevent it
+            if error.errno == errno.EPERM:  # others do not prevent that it is replaced
                 raise
         return
     new, _ = _temporary_paths(place)
@@ -181,7 +181,7 @@ def _recover(place: Path) -> None:
     _remove(new)
     if is_left(old):
         if place.exists():
-            old.rename(new)  # an .old is always complete
+            old.rename(new)  # so that an .old is always complete
             _remove(new)
         else:
             old.rename(place)

@@ -102,7 +102,7 @@ def reporting_input_errors(config: Any) -> Iterator[None]:
     try:
         yield
     except ImportError as error:
-        fail(f"nerfstudio's reader of this capture cannot be loaded: {error}. Install the module or library.", error)
+        fail(f"nerfstudio's reader of this capture cannot be loaded: {error}. Install what is missing.", error)
     except Image.DecompressionBombError as error:
         fail(f"{capture} has a photograph of more than {MAX_PIXELS:,} pixels: make it smaller", error)
     except (CaptureError, NameError, AssertionError):  # clear, or no fault of the capture

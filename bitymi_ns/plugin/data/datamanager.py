@@ -139,7 +139,7 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if count == 1 and test_mode == "val":
             fail(f"only one training view in {self.config.data}: take photographs from more sides.")
         if count < FEW_VIEWS and test_mode == "val":
-            warn(f"Only {count} training views: others will look poor. Take twenty or more photographs.")
+            warn(f"Only {count} training views: other views will look poor. Take twenty or more photographs.")
 
     def _check_points(self) -> None:
         """Warn if points have no colors, or another unit than the poses."""

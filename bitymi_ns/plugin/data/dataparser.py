@@ -109,7 +109,7 @@ class BundleCameras(DataParser):
     """Views with a bundle's cameras and without photographs."""
 
     config: BundleCamerasConfig
-    downscale_factor = None  # likewise
+    downscale_factor = None  # set by nerfstudio
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: Any) -> DataparserOutputs:
         folder = Path(self.config.data)

@@ -67,7 +67,7 @@ class TrainingRun:
             self.training.load_state_dict({"max_steps": model.trained_for, **resume_state})
             self._random_state = resume_state["random"]
             warn_of_other_capture(resume_state.get("capture"), self.capture)
-        # evenly spaced, with the last one
+        # steps of the curve's points: evenly spaced, with the last one
         self.curve_steps = {max(0, round(self.total * (i + 1) / curve_points) - 1) for i in range(curve_points)}
         resumed_from = trainer.config.load_dir or getattr(trainer.config.load_checkpoint, "parent", None)
         self.curve = TrainingCurve(
@@ -110,7 +110,7 @@ class TrainingRun:
             return
         try:
             self.forecast.compare_sizes(step, {size: self.training.seconds_at(size) for size in sorted(sizes)})
-        except (TrainingDiverged, MemoryError, RuntimeError) as error:  # its own steps end a run
+        except (TrainingDiverged, MemoryError, RuntimeError) as error:  # only a run's own steps end it
             if not isinstance(error, TrainingDiverged) and not exit_messages.out_of_memory(error):
                 raise
         give_back_memory()

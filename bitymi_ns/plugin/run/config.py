@@ -40,7 +40,7 @@ SEEDS = 1 << 32  # end of numpy's range of seeds
 @dataclass
 class BitymiTrainerConfig(TrainerConfig):
     _target: type = field(default_factory=lambda: BitymiTrainer)
-    read_from = None  # of a config.yml loaded for evaluation; no field, to stay out of config.yml
+    read_from = None  # folder of an evaluated config.yml; no field, to stay out of config.yml
     vis: Literal[
         "none", "viewer", "wandb", "tensorboard", "comet", "viewer+wandb", "viewer+tensorboard", "viewer+comet",
         "viewer_legacy",

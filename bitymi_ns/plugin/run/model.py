@@ -166,7 +166,7 @@ class BitymiModel(SurfelModel):
         self.resume_state, self.recorded_options = state.get("run", {}), state.get("train")
         self.first_surfels = state.get("first_surfels", self.first_surfels)
         if self.config.scene.near is None:
-            self.scene.near = state.get("near", 0.2)  # in older checkpoints
+            self.scene.near = state.get("near", 0.2)  # of older checkpoints
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """Load a checkpoint of any number of surfels, which `checkpoints.load` has checked."""

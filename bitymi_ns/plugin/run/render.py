@@ -137,7 +137,7 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
         fail(f"a path needs two cameras, not {len(cameras)}: --pose-source train has more, or use `ns-render spiral`.")
     path = stock(cameras=cameras, **options)
     points = Cameras(cameras.camera_to_worlds, fx=cameras.cx, fy=cameras.cy, cx=cameras.cx, cy=cameras.cy)
-    along = stock(cameras=points, **options)  # in the fields of focal lengths
+    along = stock(cameras=points, **options)  # principal points in the fields of focal lengths
     path.cx, path.cy = along.fx, along.fy
     for name in ("width", "height"):
         setattr(path, name, torch.full_like(getattr(path, name), int(getattr(cameras, name)[0])))

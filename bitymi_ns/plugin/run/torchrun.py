@@ -54,7 +54,7 @@ def run(config: TrainerConfig) -> NoReturn:
             f"--node-rank K --rdzv-endpoint HOST:PORT --nproc-per-node {count} --no-python ns-train ..."
         )
     os.environ["OMP_NUM_THREADS"] = str(max(1, torch.get_num_threads() // count))
-    os.environ["PYTHONWARNINGS"] = "ignore"  # shown already
+    os.environ["PYTHONWARNINGS"] = "ignore"  # this process has shown them
     # a step and its checkpoint may take longer than torchrun's 30 s
     os.environ.setdefault("TORCH_ELASTIC_SHUTDOWN_TIMEOUT", str(round(TIMEOUT.total_seconds())))
     logging.disable()  # torchrun's log

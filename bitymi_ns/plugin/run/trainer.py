@@ -185,7 +185,7 @@ class BitymiTrainer(Trainer):
             if self.training_state == "completed" or (before and now > before + AGAIN):
                 raise KeyboardInterrupt
             self._stop_requested = before or now
-            if number == signal.SIGINT:  # else of a batch system or torchrun
+            if number == signal.SIGINT:  # other signals are of a batch system or torchrun
                 CONSOLE.print("\nStopping after this step and saving a checkpoint; Ctrl-C again stops at once.")
 
         for number in previous:

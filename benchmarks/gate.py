@@ -76,8 +76,7 @@ Figures = dict[str, float]
 
 class Calibration:
     """Fixed mixture of the operations of training, run repeatedly while a part is timed, so that a slow machine slows
-    both. No operation dominates: the gather from 32 MB alone varies twice as much as training does when other programs
-    share the caches."""
+    both. None dominates: the gather alone varies twice as much as training when other programs share the caches."""
 
     def __init__(self) -> None:
         generator = torch.Generator().manual_seed(0)

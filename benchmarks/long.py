@@ -58,11 +58,11 @@ class Options:
     rows: tuple[str, ...] = ("bitymi",)  # A method each, and its settings: PATH=VALUE ...
     runs: tuple[str, ...] = ("10000/4", "1500/2", "300/1")  # STEPS/REDUCTION each.
     seeds: tuple[int, ...] = (0,)
-    photographs: int = 0  # Train on so many photographs only; 0 = all.
-    bake: bool = False  # Also bake: bytes, and quality of the bundle.
+    photographs: int = 0  # Train on so many photographs; 0 = all.
+    bake: bool = False  # Also bake.
     keep: Path | None = None  # Bake, and keep the bundles in this folder.
-    megabytes: tuple[float, ...] = ()  # Bake bundles of these sizes, too.
-    align: bool = False  # Align held-out poses of rows without refinement, too.
+    megabytes: tuple[float, ...] = ()  # Also bake bundles of these sizes.
+    align: bool = False  # Also align held-out poses of rows without refinement.
     device: str = "cpu"  # cpu or cuda
     work: Path = Path("outputs/long")  # Folder of the finished runs.
     output: Path | None = None  # Also write the table to this Markdown file.

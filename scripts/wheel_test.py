@@ -2,8 +2,8 @@
 """Build the wheel as `pip install .` does, check its contents, install it in isolation and run tests against it.
 
 The build starts from an empty folder with only PATH, HOME and TMPDIR of the environment, without the CUDA kernels. The
-wheel is installed to a new virtual environment that finds the dependencies of this one, but not the checkout: tests run
-on a copy of their folder, those of the kernels with each module that this CPU can run.
+wheel's virtual environment finds the dependencies of this one, but not the checkout. Tests of the kernels run with each
+module that this CPU can run.
 """
 
 import os

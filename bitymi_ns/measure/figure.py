@@ -27,8 +27,7 @@ NUMBERS = FuncFormatter(lambda value, _: f"{value:,.0f}" if abs(value) >= 1000 e
 
 
 def panels(titles: Sequence[str], x: str, y: str, most: int = 3) -> tuple[Figure, list[Axes]]:
-    """Create a figure with a panel per title, which a single panel does not show, at most `most` per row. `x`, `y`:
-    labels of the axes."""
+    """Create a figure with a panel per title, at most `most` per row. `x`, `y`: labels of the axes."""
     columns = min(most, len(titles))
     rows = math.ceil(len(titles) / columns)
     width, height = (6.4, 3.9) if columns == 1 else (3.5 * columns, 2.9)

@@ -34,8 +34,7 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def page(title: str, body: str, notes: Sequence[str] = (), commits: Sequence[str] = ()) -> str:
-    """Format a section: title, command line, machine and commit, body, notes. `commits`: those of the figures; empty:
-    this checkout's."""
+    """Format a section with its provenance. `commits`: those of the figures; empty: this checkout's."""
     measured = sorted(set(commits)) or [commit()]
     script = sys.argv[0].endswith(".py")
     program = ["python", os.path.relpath(sys.argv[0])] if script else [os.path.basename(sys.argv[0])]
@@ -67,5 +66,5 @@ TEMPLATES.filters["data_uri"] = lambda data, mime: f"data:{mime};base64,{base64.
 
 
 def rendered(template: str, **values: Any) -> str:
-    """Render a template. Values are escaped in .html.j2; an undefined name is an error."""
+    """Render a template. Values are escaped in .html.j2."""
     return TEMPLATES.get_template(template).render(**values)

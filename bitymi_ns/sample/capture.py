@@ -110,9 +110,9 @@ def generate(
     overwrite: bool = False,
     progress: Progress = no_progress,
 ) -> Path:
-    """Write transforms.json (one pinhole camera, exact poses), images and sparse_pc.ply to a folder, whole or not at
-    all, and return it. Equal arguments give equal files. Raises ValueError: an argument is too small; FileExistsError:
-    the folder holds other files, or `overwrite` is False; NotADirectoryError: it is a file."""
+    """Write transforms.json, images and sparse_pc.ply to a folder, whole or not at all, and return it. Equal arguments
+    give equal files. Raises ValueError: an argument is too small; FileExistsError: the folder holds other files, or
+    `overwrite` is False; NotADirectoryError: it is a file."""
     limits = {"views": (views, 1), "width": (width, 8), "height": (height, 8), "points": (points, 0), "seed": (seed, 0)}
     for name, (value, least) in limits.items():
         if value < least:

@@ -65,8 +65,7 @@ class Cells:
         return self.known.get(identity(key))
 
     def add(self, key: dict[str, Any], value: dict[str, Any], origin: dict[str, Any]) -> None:
-        """Append a cell, after removing a truncated last line; NaN and infinite numbers become None. Raises BenchError:
-        the file cannot be written."""
+        """Append a cell, in place of a truncated last line; NaN and infinite numbers become None. Raises BenchError."""
         cell = {"key": key, "value": value, "made": origin}
         cell = json.loads(json.dumps(cell), parse_constant=lambda constant: None)
         line = json.dumps(cell).encode("utf8") + b"\n"

@@ -96,8 +96,8 @@ def _run_cell(work: Path, cell: Cell, cells: Cells, lock: Lock) -> None:
 
 
 def run_chains(work: Path, chains: Sequence[Chain]) -> list[str]:
-    """Execute the missing cells, except those that depend on a failed one. Returns a message for each failed cell and
-    each run locked by another process. Raises BenchError: there is nothing to run."""
+    """Execute the missing cells, except those that depend on a failed one. Returns a message per failed cell and per
+    locked run. Raises BenchError: there is nothing to run."""
     if not any(chains):
         raise BenchError("nothing to run: there is no scene, or no method")
     cells, total, failures = Cells(work / FILE), sum(map(len, chains)), []

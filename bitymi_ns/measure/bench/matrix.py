@@ -25,10 +25,10 @@ PlanName = Literal["ablation", "overdraw", "resolution", "atlas", "rate"]  # in 
 class Scene:
     """A capture and its dataparser."""
 
-    scene: str  # label in tables, and nerfstudio's experiment name
+    scene: str  # nerfstudio's experiment name
     data: str  # absolute folder
     suite: str = "local"  # name of the data set, or `local`
-    parser: tuple[str, ...] = ()  # nerfstudio's dataparser and its options; empty: the method's own
+    parser: tuple[str, ...] = ()  # dataparser and its options; empty: the method's own
 
 
 class Row(NamedTuple):
@@ -138,8 +138,8 @@ def read_plan(name: PlanName) -> tuple[dict[str, Row], dict[str, list[str]]]:
 
 
 def local_scenes(folders: Sequence[Path]) -> list[Scene]:
-    """List captures in any format that `ns-train bitymi --data` reads. A Blender data set uses the points of its
-    `hull_pc.ply`, if any. Raises BenchError: a folder is not a capture, two have the same name, or there is none."""
+    """List captures in any format; a Blender data set uses the points of its `hull_pc.ply`, if any. Raises BenchError:
+    a folder is not a capture, two have the same name, or there is none."""
     if not folders:
         raise BenchError('no capture: give --data with one or more folders, as in --data "captures/fox"')
     scenes = []

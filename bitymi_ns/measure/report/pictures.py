@@ -43,11 +43,11 @@ class Group(NamedTuple):
 
 
 class View(NamedTuple):
-    """A photograph beside its render: file, PSNR in dB, and digest of the photograph."""
+    """A photograph beside its render."""
 
     path: Path
-    psnr: float
-    digest: bytes
+    psnr: float  # dB
+    digest: bytes  # of the photograph
 
 
 def open_image(path: Path) -> Image.Image:
@@ -81,7 +81,7 @@ def _halves(path: Path) -> tuple[Pixels, Pixels]:
 
 
 def _columns(views: dict[str, View]) -> list[list[Picture]]:
-    """Draw a photograph, and each folder's render above its error map; with one folder beside it."""
+    """Draw a photograph, and each folder's render above its error map, or beside it for one folder."""
     columns = []
     for name, view in views.items():
         photograph, render = _halves(view.path)

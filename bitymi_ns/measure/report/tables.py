@@ -93,8 +93,7 @@ NOTES = (
 
 
 def scene_table(title: str, evaluations: list[Evaluation], columns: Sequence[Column], note: str = "") -> Table:
-    """Build the table of one scene: sections of trained scenes and of bundles, with the best values of each column
-    marked unless all are equal."""
+    """Build the table of one scene, with the best values of each column marked unless all are equal."""
     ordered = sorted(evaluations, key=lambda row: (row.baked, row.label))
     figures = {column: [column.value(row) for row in ordered] for column in columns}
     figures = {column: values for column, values in figures.items() if any(value is not None for value in values)}

@@ -56,7 +56,7 @@ PROBES = 3  # random perturbations of the inputs for `Errors.input_*`
 
 
 class Errors(NamedTuple):
-    """Errors of one case, each the maximum over all elements, relative to the largest value of the image or gradient.
+    """Largest errors of one case, relative to the largest value of the image or gradient.
 
     A pixel is compared, and counts for the loss, only if both renderers blend the same surfels there, in the same
     branch of the kernel, and fetch between the same texels. In the other, flipped pixels rounding moved a value across

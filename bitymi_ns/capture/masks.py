@@ -92,8 +92,6 @@ def mask_pixels(image: Image.Image) -> npt.NDArray[np.bool_]:
 
 def checked_mask(path: Path) -> Image.Image:
     """Read a mask as a 1-bit image, True where pixels count. Raises CaptureError: it cannot be read."""
-    if not path.exists():
-        fail(f"the mask {path} is missing")
     with parsing(f"the mask {path}", "Replace it, or remove the masks."), open_picture(path) as image:
         return Image.fromarray(mask_pixels(image) ^ _is_dynamic(path))
 
@@ -137,7 +135,7 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
     for (mask, photograph), known in zip(masked.items(), sizes, strict=True):
         size = known or checked_mask(mask).size
         if not in_proportion(size, photograph.camera.size):
-            fail(f"{wrong_size(mask, size, photograph.camera.size)} {LEAVE_OUT[0].upper()}{LEAVE_OUT[1:]}.")
+            fail(f"{wrong_size(mask, size, photograph.camera.size)} {LEAVE_OUT}.")
 
 
 def write_colmap_masks(folder: Path, masks: Mapping[str, tuple[Path, tuple[int, int]]]) -> str | None:

@@ -57,7 +57,7 @@ class Transforms:
     named: frozenset[Path]  # pictures, masks and maps
 
 
-def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_masks: bool = True) -> Transforms:
+def read_transforms(path: Path, own_format: bool, need_photos: bool, use_masks: bool) -> Transforms:
     """Read a JSON file, make poses rotations, and find its photographs, maps and masks. Raises CaptureError."""
     if not os.path.lexists(path):
         fail(f"{path} does not exist. {HOW_TO_GET_ONE}")
@@ -92,14 +92,13 @@ def read_transforms(path: Path, own_format: bool, need_photos: bool = True, use_
     unused += [f"{key} of frames" for key in dict.fromkeys(k for f in frames for k in f) if key not in known]
     if unused:
         say(f"Entries of {path} that are not used: {listed(unused, most=12)}.")
-    made: dict[ColmapCamera, ColmapCamera] = {}
     photographs = []
     for frame, file, mask, beside in zip(frames, files, masks, maps, strict=True):
         label = f"the camera of {frame['file_path']} in {path}"
         with parsing(label, "Correct its entries."):
             camera = _camera(path, meta, frame, file)
         pose = np.array(frame["transform_matrix"])
-        photographs.append(Photograph(file, made.setdefault(camera, camera), pose, label, mask, maps=beside))
+        photographs.append(Photograph(file, camera, pose, label, mask, maps=beside))
     photographs.sort(key=lambda photograph: photograph.file)
     used = [*files, *masks, *(file for each in maps for file in astuple(each))]
     named = frozenset(Path(os.path.normpath(file)) for file in used if file is not None)

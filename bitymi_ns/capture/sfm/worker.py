@@ -27,14 +27,12 @@ class Stages:
         self.seconds: dict[str, float] = {}
         self._since = time.monotonic()
         self._stage = "starting"
-        self._lock = threading.Lock()
 
     def __call__(self, step: str, done: int, total: int) -> None:
-        with self._lock:
-            now = time.monotonic()
-            self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
-            self._stage, self._since = step, now
-            send(stage=step, done=done, total=total)
+        now = time.monotonic()
+        self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
+        self._stage, self._since = step, now
+        send(stage=step, done=done, total=total)
 
 
 def send(**line: object) -> None:

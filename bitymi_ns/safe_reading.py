@@ -23,8 +23,7 @@ MOST_TEXT = 1 << 30  # most bytes of JSON or text; 100,000 photographs need a te
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file for reading, also through a link; opening a pipe would block. Raises OSError, `strerror` says
-    why."""
+    """Open a regular file, also through a link; opening a pipe would block. Raises OSError, `strerror` says why."""
     try:
         found = os.stat(path)
     except ValueError:  # a null character

@@ -76,8 +76,7 @@ def is_left(folder: Path) -> bool:
 
 def own_folder(folder: Path, close: bool = False) -> None:
     """Create a folder, if missing, that only the user can write to; its parent is not checked. `close`: take write
-    permission from others, as the contents do not matter. Raises Refused: it is another user's, others can write to it,
-    or it is a link."""
+    permission from others. Raises Refused: it is another user's, others can write to it, or it is a link."""
     with suppress(FileExistsError):
         folder.mkdir(mode=0o755)
         close = True  # an ACL of the parent may have granted more rights

@@ -50,8 +50,7 @@ def maps_called(folder: Path, depth: str, confidence: str) -> MapFiles:
 
 
 def maps_beside(photographs: Sequence[Path]) -> list[MapFiles]:
-    """Find maps of a scanner's photographs beside their folder; warn of a folder of color pictures, which is not
-    used."""
+    """Find maps of a scanner's photographs beside their folder; warn of color pictures, which are not used."""
     maps = [maps_called(path.parent.parent, f"depth/{path.stem}", f"confidence/{path.stem}") for path in photographs]
     depths = [files.depth for files in maps if files.depth is not None]
     if depths and all(_is_color(depths[i]) for i in spread(len(depths), COLOR_SAMPLES)):
@@ -93,8 +92,7 @@ def read_depth(files: MapFiles, lens: Lens, unit: float | None = None) -> Values
 
 def read_normal(files: MapFiles, lens: Lens) -> Values:
     """Read normals [H, W, 3] for the pinhole picture of a lens, in its frame (OpenCV axes); 0 = unknown. Files hold
-    them in the camera's OpenGL axes, as floats, or as colors (n + 1) / 2 with black for unknown. Raises
-    CaptureError."""
+    them in the camera's OpenGL axes, as floats, or colors (n + 1) / 2 with black for unknown. Raises CaptureError."""
     assert files.normal is not None
     stored = _read(files.normal, lens.stored)
     if stored.ndim != 3 or stored.shape[2] < 3:

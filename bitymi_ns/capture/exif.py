@@ -122,7 +122,7 @@ def _up(image: Image.Image, tags: Mapping[int, Any], detail: Mapping[int, Any]) 
     left, bottom, into = (value / math.hypot(*down) for value in down)
     # the sensor's rows run from top to bottom of the phone, its columns from right to left
     turns = {1: (bottom, left), 3: (-bottom, -left), 6: (-left, bottom), 8: (left, -bottom)}
-    # Pillow has turned HEIC
+    # Pillow has turned HEIC already
     orientation = image.info.get("original_orientation") or tags.get(ExifTags.Base.Orientation, 1)
     if orientation not in turns:
         return None

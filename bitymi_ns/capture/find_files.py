@@ -35,8 +35,8 @@ def without_extension(parts: Parts) -> Parts:
 
 @dataclass
 class FileFinder:
-    """Finder of files: by the exact name, else by the only one that differs in what `folded` removes or in leading
-    folders, else also in the extension."""
+    """Finder of files by the exact name, else by `folded` names without leading folders, else without extension, if
+    unique."""
 
     folder: Path  # to which names are relative
     outside: bool = False  # allow names that lead out of it

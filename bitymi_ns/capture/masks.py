@@ -139,8 +139,7 @@ def check_masks(photographs: Sequence[Photograph]) -> None:
 
 
 def write_colmap_masks(folder: Path, masks: Mapping[str, tuple[Path, tuple[int, int]]]) -> str | None:
-    """Write the masks of upright photographs as COLMAP reads them: grey, and of the photographs' sizes, which are
-    given. Return the folder, emptied before; None = no masks."""
+    """Write masks as COLMAP reads them, grey and of the photographs' sizes; return their folder, None = no masks."""
     emptied(folder)
     for name, (path, size) in masks.items():
         mask = checked_mask(path)

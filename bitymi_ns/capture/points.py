@@ -1,5 +1,4 @@
-"""Point clouds: read PLY files, choose one, and color points by photographs. nerfstudio's PLY reader returns
-uninitialized memory for missing points, and divides all colors by 255."""
+"""Point clouds. nerfstudio's PLY reader returns uninitialized memory for missing points, and divides colors by 255."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,8 +25,7 @@ GREY = 128
 STEP = 0.1  # of the distance from a camera
 MOST_COMPARED = 1_000_000  # points of a cloud
 SAME = 0.5
-"""Least share of triangulated points on the surfaces of a cloud that is used: at least 0.6 of right ones, else 0.4 at
-most."""
+"""Least share of triangulated points on the surfaces of a used cloud: at least 0.6 of right ones, else 0.4 at most."""
 
 
 class Points(NamedTuple):
@@ -45,8 +43,8 @@ def color_bytes(values: npt.NDArray[np.float64], floating: bool) -> tuple[npt.ND
 
 
 def read_cloud(path: Path, remedy: str) -> tuple[Points, str]:
-    """Read the points of a PLY file, and why they have no colors, as a clause (empty if they have). Raises
-    CaptureError: it cannot be read; `remedy` says what to do."""
+    """Read the points of a PLY file, and why they have no colors (empty if they have). Raises CaptureError with
+    `remedy`."""
     with parsing(f"the point cloud {path}", remedy):
         header = read_header(path)
         points = header.elements.get(VERTEX)

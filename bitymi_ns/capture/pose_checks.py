@@ -24,9 +24,8 @@ USUAL_SPREAD, MAX_SPREAD = 2.5, 25.0
 
 
 def rotations(matrices: npt.NDArray[np.float64], names: Sequence[object], source: str) -> npt.NDArray[np.float64]:
-    """Recover rotations, also mirrored, from the 3 x 3 parts [N, 3, 3] of poses: divide out each matrix's factor, and
-    undo rounding by the nearest rotation; valid ones stay equal. Raises CaptureError: a matrix is not finite, zero or
-    sheared."""
+    """Recover rotations, also mirrored, from the 3 x 3 parts [N, 3, 3] of poses: divide out their factors, and undo
+    rounding by the nearest rotation; valid ones stay equal. Raises CaptureError: one is not finite, zero or sheared."""
     result = matrices.copy()
     finite = np.isfinite(matrices).all((1, 2))
     largest = np.abs(np.where(finite[:, None, None], matrices, 0.0)).max((1, 2))  # squares may overflow
@@ -153,8 +152,7 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
 def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
-    """Warn if points [N, 3] seem to be in another unit than finite cameras [M, 3]: far beyond these, or a spot of the
-    pictures, whose `widths` [M] are in focal lengths."""
+    """Warn if points [N, 3] seem to be in another unit than cameras [M, 3], with `widths` [M] in focal lengths."""
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]
     if len(points) == 0:

@@ -264,8 +264,8 @@ class _Reader:
         return Capture(found.format, source, photographs, points, self.options, lists)
 
     def _blender(self) -> Capture:
-        """Read a Blender data set with its own split. If one of the val and test files is missing, or lacks all its
-        photographs, the other serves for both."""
+        """Read a Blender data set. If its val or test file is missing, or lacks all its photographs, the other serves
+        for both."""
         options, found, need_photos = self.options, self.found, self.need_photos
         train = self._read_transforms(found.folder / SPLITS[0])
         every, named, source = list(train.photographs), set(train.named), str(train.path)

@@ -1,5 +1,4 @@
-"""Decide how poses and intrinsics are to be read: match photographs without poses, and count what each reading
-explains."""
+"""Decide how poses and intrinsics are to be read: match photographs, and count what each reading explains."""
 
 import os
 import shlex
@@ -37,8 +36,7 @@ INTRINSICS = {f"intrinsics{factor:g}": factor for factor in (0.125, 0.25, 0.5, 2
 ENOUGH = 100  # matches that decide
 FITS = 0.5  # least share of matches that poses explain, relative to the pairs' own poses
 LEAD = 2.0
-"""Least ratio of what a reading explains to what poses explain as written: at most 0.26 if these are right, else at
-least 3.9."""
+"""Least ratio of what a reading explains to what poses do as written: up to 0.26 if these are right, else from 3.9."""
 CLIPS, CLIP = 6, 6  # runs of photographs consecutive by name, and photographs of each
 SIDE = 500  # longer side of reduced photographs, pixels; twice that of 360-degree pictures
 FEATURES, COARSE = 1500, 128  # per photograph; largest ones that decide on likeness
@@ -223,8 +221,8 @@ class Decision(NamedTuple):
 
 
 def decide(photographs: Sequence[Photograph], poses: Array, written: Reading) -> Decision:
-    """Find the reading by which the poses explain by far most of what pairs have in common; as written if that is too
-    little, or a camera cannot be used."""
+    """Find the reading by which poses explain by far most matches of pairs; as written if too few, or cameras are
+    unusable."""
     cameras, every = [each.camera for each in photographs], readings(written)
     lenses = [camera.colmap for camera in dict.fromkeys(cameras)]
     focals = [value for lens in lenses for value in lens.params[lens.focal_length_idxs()]]

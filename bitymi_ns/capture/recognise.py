@@ -53,9 +53,8 @@ class Found:
 
 
 def recognise(data: Path, format: Format | Literal["auto"] = "auto", colmap_path: Path | None = None) -> Found:
-    """Recognize the capture of a `format` (auto = any, poses before photographs without) at a folder, or a file:
-    transforms.json, a video, or of a COLMAP model. `colmap_path` is relative to the capture. Raises CaptureError: there
-    is none."""
+    """Recognize the capture of a `format` (auto = any, poses before photographs without) at a folder or a file.
+    `colmap_path` of a model is relative to it. Raises CaptureError: there is none."""
     if not data.exists():
         fail(f"the capture {data} does not exist. Give a folder or a file with --data.")
     if colmap_path is not None:

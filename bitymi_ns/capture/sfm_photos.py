@@ -1,5 +1,4 @@
-"""Photographs for structure from motion. 360-degree pictures are told by metadata or content, as others have that
-shape, too."""
+"""Photographs for structure from motion; 360-degree ones are told by metadata or content, not by their aspect ratio."""
 
 import os
 import re
@@ -172,8 +171,8 @@ def upright(photo: Photo) -> Image.Image:
 def upright_photos(
     photos: Sequence[Photo], folder: Path, work: Path, progress: Progress
 ) -> tuple[Path, dict[str, str]]:
-    """Write upright JPEG copies of the photographs that need one. Return the folder to read (`folder` itself if none
-    does, else one with links to the others), and the names in it by photograph."""
+    """Write upright JPEG copies of photographs that need one; return the folder to read and the names in it by
+    photograph."""
     if all(photo.plain for photo in photos):
         return folder, {photo.name: photo.name for photo in photos}
     names = {photo.name: photo.name if photo.plain else photo.name + COPY for photo in photos}

@@ -38,8 +38,7 @@ class KeptPoses(NamedTuple):
 
 
 def find_sfm_source(found: Found, masks_path: Path | None, settings: SfmSettings, use_masks: bool = True) -> Source:
-    """Find poses of photographs or a video. `masks_path` is relative to the capture. Raises CaptureError: see
-    `find_poses`."""
+    """Find poses of photographs or a video; `masks_path` is relative to the capture. Raises CaptureError."""
     from bitymi_ns.progress import rich_progress
     from .poses import find_poses  # slow to import
 
@@ -112,14 +111,14 @@ def kept_settings(folder: Path, requested: SfmSettings) -> SfmSettings:
     if unused:
         warn(
             f"{' and '.join(unused)} {'is' if len(unused) == 1 else 'are'} not used: the run goes on with the poses it "
-            f"was trained with, in {folder}. Without --load-dir and --load-checkpoint, others are computed."
+            f"was trained with, in {folder}. For others leave out --load-dir and --load-checkpoint."
         )
     return settings or requested
 
 
 def write_kept_poses(folder: Path, source: Source, origin: Origin) -> None:
     """Copy a model into an existing folder, and its photographs if they are upright copies or frames: hard links where
-    possible, symbolic links as they are. Raises OSError: it cannot be written, or a name leads out of the folder."""
+    possible. Raises OSError: it cannot be written, or a name leads out of the folder."""
     copy_files(source.folder, folder / MODEL)
     if origin.photographs is None:
         for image in source.model.images:

@@ -31,7 +31,7 @@ class SplitOptions:
     """Photographs to hold out for evaluation."""
 
     eval_mode: Mode = "interval"
-    """Photographs to hold out: evenly spaced ones, those with eval in their names, every n-th, or none (all serve for
+    """Photographs to hold out: evenly spaced ones, those with eval in their names, every n-th, or none (all for
     both)."""
     eval_interval: int = 8  # Hold out every n-th photograph by name, with --eval-mode interval.
     train_split_fraction: float = 0.9  # Share of the photographs to train on, with --eval-mode fraction.
@@ -141,8 +141,8 @@ def _names_in(path: Path, what: object) -> list[str]:
 
 
 def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLists:
-    """Read the lists of nerfstudio's COLMAP parser: train, val or validation, and test, as `*_list.txt`; else 3DGS's
-    `test.txt` in the model's folder, which may name more than the photographs' `files`."""
+    """Read the lists of nerfstudio's COLMAP parser (`*_list.txt`), else 3DGS's `test.txt` in the model's folder, which
+    may name more than the photographs' `files`."""
     stated = [(row.what, folder / name) for row in LISTS for name in row.names.split()]
     lists, test = {split: _names_in(path, path) for split, path in stated if path.is_file()}, model / "test.txt"
     if lists or not test.is_file():

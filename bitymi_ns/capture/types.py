@@ -134,8 +134,7 @@ class SfmSettings:
     """Settings of structure from motion; they are part of the key under which a result is cached."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Pairs to match: all (exhaustive), neighbors and similar photographs (sequential), or by number, order and GPS
-    positions (auto)."""
+    """Pairs to match: all (exhaustive), neighbors and similar ones (sequential), or by number, order and GPS (auto)."""
     mapper: Literal["auto", "global", "incremental"] = "auto"
     """Register all cameras at once (global) or one after the other (incremental); auto = global, else incremental."""
     camera_model: Literal[
@@ -155,7 +154,7 @@ class SfmOptions(SfmSettings):
 
     masks: Path | None = None
     """Folder of masks; black pixels get no features. None = `masks` beside the photographs or in their folder, if
-    there is one."""
+    any."""
     use_masks: bool = True  # Use masks; else ignore their folder.
 
     def __post_init__(self) -> None:

@@ -44,8 +44,7 @@ TO_709 = np.array([[1.6605, -0.5876, -0.0728], [-0.1246, 1.1329, -0.0083], [-0.0
 
 
 def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -> Path:
-    """Write the frames of a video with `poses` known poses beside it, as stored. Raises CaptureError: their numbers
-    differ."""
+    """Write the frames of a video with `poses` known poses beside it. Raises CaptureError: their numbers differ."""
 
     def extract(work: Path) -> None:
         total = _pace(video)[2]
@@ -59,7 +58,7 @@ def frames_with_poses(video: Path, poses: int, progress: Progress, tell: Tell) -
 
 def extract_frames(video: Path, work: Path, count: int | None, progress: Progress, upright: bool = True) -> Path:
     """Write `count` frames of a video, or one per STRIDE of motion, `upright` or as stored, to `images` in the work
-    folder, whole or not at all: frame_000012.jpg is number 12, from 0. Raises CaptureError: nothing moves in it."""
+    folder: frame_000012.jpg is number 12, from 0. Raises CaptureError: nothing moves in it."""
     target = work / IMAGES
     if target.is_dir():
         return target

@@ -17,8 +17,7 @@ from .job import PAIRS, CameraGroup, Job
 AT_ONCE = 8  # photographs per processor of which features are found before progress is told
 SMALL = 1000  # pixels; photographs with a shorter longer side are doubled
 SPHERICAL_SCALE = 2
-"""Factor on `SMALL` and the largest image size for 360-degree pictures, whose details are small: with half the
-features, camera positions were wrong by a metre among perspective photographs."""
+"""Factor on `SMALL` and the largest image size for 360-degree pictures, which need features twice as dense."""
 FEW = 30  # most photographs that are all compared with all
 WORTH_ALL = 150  # most that are, if too few get a pose otherwise
 NEIGHBOURS = 20  # photographs that each is compared with, by likeness or by GPS

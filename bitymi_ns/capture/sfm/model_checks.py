@@ -154,8 +154,7 @@ def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Remove the poses of cameras that too few points link to the largest group: mappers register them by directions
-    between pairs, whose points the filters may have removed."""
+    """Remove the poses of cameras that too few points link to the largest group: filters may have removed theirs."""
     placed = [image for image in model.images.values() if image.has_pose]
     column = {image.image_id: i for i, image in enumerate(placed)}
     tracks = [sorted({column[e.image_id] for e in p.track.elements}) for p in model.points3D.values()]

@@ -104,7 +104,8 @@ class Coder:
         reduced = replace(scene, surfels={**scene.surfels, **self._view_colors(START)})
         self._noise = column_noise(reduced, self._sizes, baked.extent, self._pictures, progress)
         self._residual = tile_means(baked.texels, baked.sizes)[:, :3]
-        self._tiles, self._coverage = None, baked.texels.new_zeros(len(baked.texels), 2)
+        self._tiles = None
+        self._coverage = baked.texels.new_zeros(len(baked.texels), 2)
         if baked.textured:
             texels = TexelList(baked)
             self._tiles = texels.tiles
@@ -135,11 +136,13 @@ class Coder:
         coverage, coded = self._coverage, None
         if self._tiles is not None:
             moved = self._tiles.rows_of(order.to(baked.device)).cpu()
-            texels, coverage = baked.texels[moved, :3], coverage[moved]
+            texels = baked.texels[moved, :3]
+            coverage = coverage[moved]
             coder = TexelCoder(self._sizes[order], coverage[:, 1], step)
             alphas = None if baked.alpha is None else coder.code_alpha(baked.alpha.values[moved])
             coded, listed = coder.code(texels), joined(texels, alphas)
-            decoded, means = joined(coded.texels(coder.blocks), alphas), coded.means
+            decoded = joined(coded.texels(coder.blocks), alphas)
+            means = coded.means
         scene = replace(baked.scene, surfels=codes.surfels())
         rounded = baked.become(
             Rounded,
@@ -205,7 +208,8 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | 
     """Measure relative bytes and PSNR at about half and twice the bytes; None without views."""
     if not coder.measured:
         return None
-    alternatives, base = [], coder.at(chosen.lmbda, held_out=True).psnr
+    alternatives = []
+    base = coder.at(chosen.lmbda, held_out=True).psnr
     for wanted, factor in ALTERNATIVES.items():
         tried = [(0.0, 0.0)]  # logarithms of lambda and bytes over the chosen ones
         step = math.log(factor)
@@ -238,7 +242,8 @@ def _search(
         points = {tried: points[tried] for tried in {low, high, min(points), max(points)} - {None}}  # frees memory
         if low == most or 0.9 <= ratio <= 1:
             break
-        least, largest = low or lmbda / 8, high or min(most, lmbda * 8)
+        least = low or lmbda / 8
+        largest = high or min(most, lmbda * 8)
         guess = 0.95 * lmbda / ratio if 0 < ratio < math.inf else 0.0
         if not 1.05 * least < guess < largest / 1.05:
             guess = math.sqrt(least * largest) if low and high else least if low is None else largest

@@ -82,7 +82,8 @@ def column_noise(
     moved = {name: None if value is None else value[order].contiguous() for name, value in moved.items()}
     plain = replace(scene, surfels=reordered(scene.surfels, order), **moved)
     drawn = pictures.of(scene)
-    rounded, tiled = codes.surfels(), torch.from_numpy(codes.sizes[:, 0] > 0)
+    rounded = codes.surfels()
+    tiled = torch.from_numpy(codes.sizes[:, 0] > 0)
     extent = torch.where(tiled, codes.extent(1.0), extent[order])
     noise, counts = {}, {}
     for done, name in enumerate(REFERENCE):

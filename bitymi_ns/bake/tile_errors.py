@@ -28,8 +28,10 @@ def listed_errors(
 
     Returns [N] root mean squares, 8-bit steps, of the differences times the largest blending weight at the texel; and
     [N] bool, whether any fragment of the surfel gets a residual."""
-    errors, seen = torch.zeros(len(sizes)), torch.zeros(len(sizes), dtype=torch.bool)
-    first, bare = first_texels(sizes), torch.nonzero(sizes[:, 0] == 0).squeeze(1)
+    errors = torch.zeros(len(sizes))
+    seen = torch.zeros(len(sizes), dtype=torch.bool)
+    first = first_texels(sizes)
+    bare = torch.nonzero(sizes[:, 0] == 0).squeeze(1)
     constants = (
         (_CONSTANT, rows, first[rows, None, None].expand(-1, *_CONSTANT)) for rows in bare.split(max(1, chunk // 64))
     )
@@ -44,7 +46,8 @@ def listed_errors(
 def closest_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: float, near: float) -> Tensor:
     """Compute the pixels per scale unit [N, 2] along u and v in the view that shows a surfel largest; 0 if its square
     of half side `extent`, scale units, meets no image. `near`: camera z."""
-    axes, scales = tangents(surfels["quats"]), surfels["log_scales"].exp()
+    axes = tangents(surfels["quats"])
+    scales = surfels["log_scales"].exp()
     return max_projected_extent(surfels["means"], axes, scales, cameras, extent, near) / (2.0 * extent)
 
 

@@ -113,7 +113,8 @@ def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progres
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
     device, parts, done = opacity.device, [], 0
     shown = TileVisibility(opacity, beta, tiles.extent.to(device), inputs.weight_bound)
-    fine, constant = tiles.texels.to(device), tiles.texels[first_texels(tiles.sizes)]
+    fine = tiles.texels.to(device)
+    constant = tiles.texels[first_texels(tiles.sizes)]
     sizes = torch.zeros(len(tiles.sizes), 2, dtype=torch.int32)
     for size, rows, index in listed_tiles(tiles.sizes.to(device), options.chunk):
         values = fine[index].permute(0, 3, 1, 2).contiguous()

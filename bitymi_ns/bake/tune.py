@@ -155,7 +155,8 @@ def tune_atlas(
         covered = baked.coverage.to(baked.device)
         coder = Cosines(baked, baked.coverage[:, 1])
     else:
-        covered, coder = texels.coverage(trained, progress), Pages(baked)
+        covered = texels.coverage(trained, progress)
+        coder = Pages(baked)
     step_size = 1.0 / (covered[:, 0] + options.prior)  # [T]
     moved = texels.values.clone()
     for step in range(options.steps):

@@ -105,7 +105,8 @@ class TuningViews(Sequence[TuningView]):
 
     @torch.no_grad()
     def _traced(self, view: View) -> TuningView:
-        scene, projection = self._texels.scene, self._texels.projection(view.camera)
+        scene = self._texels.scene
+        projection = self._texels.projection(view.camera)
         self._projection = self._projection or projection
         p, camera = scene.surfels, projection.camera
         base = view_color(scene.view_color, p, p["means"], camera.exact_center, projection.visible)

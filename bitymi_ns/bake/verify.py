@@ -38,7 +38,8 @@ def check_view_color(bundle: Bundle, surfels: Mapping[str, Tensor], cameras: Seq
         return Check(name, False, f"surfel {rows.index(None)} is none of the trained scene")
     trained = {name: value[torch.tensor(rows)] for name, value in trained.items()}
     means, render = bundle.scene.surfels["means"], bundle.info.render
-    seen, transmittance = means.new_zeros(0, len(means), dtype=torch.bool), None
+    seen = means.new_zeros(0, len(means), dtype=torch.bool)
+    transmittance = None
     if cameras:
         views = visibility(trained, cameras, render.near, alpha=texel_alpha(bundle.scene))
         seen, transmittance = views.seen, views.in_front

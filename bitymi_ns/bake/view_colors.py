@@ -47,7 +47,8 @@ class ColorChoices:
             count = torch.where(self.error.isfinite(), numbers, 0).amax(1)
         else:
             count = (self.error + lmbda * BITS_PER_NUMBER * self.width * numbers).argmin(1)
-        first, base = count.cumsum(0) - count, self.error.new_zeros(len(count), 3)
+        first = count.cumsum(0) - count
+        base = self.error.new_zeros(len(count), 3)
         listed = self.error.new_zeros(int(count.sum()), self.width)
         for rows, bases, terms in self.choices:
             chosen = count[rows] == terms.shape[1]
@@ -170,7 +171,8 @@ def _unseen(means: Tensor, weights: Tensor, centers: Tensor, near: float) -> tup
     and their weights [n, BLIND]: a share of the mean weight of the views that show it, scaled by the inverse square of
     the distance; 0 without such a view."""
     offset = means.double()[:, None] - centers.to(means.device)  # [n, V, 3]
-    square, shows = offset.square().sum(2).clamp(min=near * near), weights.T > 0
+    square = offset.square().sum(2).clamp(min=near * near)
+    shows = weights.T > 0
     from_unit = (weights.T * square).sum(1) / shows.sum(1).clamp(min=1)
     nearest = square.masked_fill(shows, torch.inf).topk(min(BLIND, len(centers)), largest=False)
     unit = F.normalize(offset.gather(1, nearest.indices[..., None].expand(-1, -1, 3)), dim=2)

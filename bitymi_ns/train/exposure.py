@@ -85,7 +85,8 @@ class Exposure:
         table = gains.new_zeros(len(gains), 12 if self.kind == "affine" else 3)
         table[:, _diagonal(table)] = gains
         self.table = settled(table)
-        self._moments, self._steps = table.new_zeros(2, *table.shape), 0
+        self._moments = table.new_zeros(2, *table.shape)
+        self._steps = 0
 
     def _summed(self, values: Tensor) -> Tensor:
         """Sum values [V, C] of the views of each photograph."""

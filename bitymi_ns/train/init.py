@@ -151,7 +151,8 @@ def _usable(xyz: Tensor, rgb: Tensor) -> tuple[Tensor, Tensor, PointReport]:
     report = PointReport(given=len(xyz))
     finite = xyz.isfinite().all(-1)
     report.not_finite = int((~finite).sum())
-    xyz, rgb = xyz[finite], rgb[finite].nan_to_num(0.5, 0.5, 0.5).clamp(0.0, 1.0)
+    xyz = xyz[finite]
+    rgb = rgb[finite].nan_to_num(0.5, 0.5, 0.5).clamp(0.0, 1.0)
     if len(xyz) == 0:
         return xyz, rgb, report
     _, first = np.unique(xyz.numpy() + 0.0, axis=0, return_index=True)  # + 0.0 turns -0 into 0

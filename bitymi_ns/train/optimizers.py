@@ -86,7 +86,8 @@ def _kernel_arguments(optimizer: Optimizer, factors: Tensor | None) -> list[dict
         if any(group.get(name) != value for name, value in PLAIN.items()) or not isinstance(group["lr"], float):
             return None
         for parameter in group["params"]:
-            gradient, state = parameter.grad, optimizer.state.get(parameter)
+            gradient = parameter.grad
+            state = optimizer.state.get(parameter)
             if gradient is None:
                 continue
             if not state or gradient.is_sparse or state["step"].device != parameter.device:

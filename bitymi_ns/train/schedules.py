@@ -184,7 +184,8 @@ class Schedule:
         if name == "means" and not self.in_pixels:
             factor *= self.extent
         elif name in PARAMETERS:
-            factor, name = factor * PARAMETERS[name].rate_factor, PARAMETERS[name].rate
+            factor = factor * PARAMETERS[name].rate_factor
+            name = PARAMETERS[name].rate
         rate = getattr(rates, name)
         if not isinstance(rate, tuple):
             return factor * float(rate)

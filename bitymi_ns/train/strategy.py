@@ -100,7 +100,8 @@ class Strategy:
         if self.processes.views == 1:
             self._accumulate_view(*projections)
             return
-        before, self.statistics = self.statistics, torch.zeros(len(STATISTICS), 0)
+        before = self.statistics
+        self.statistics = torch.zeros(len(STATISTICS), 0)
         for projection in projections:
             self._accumulate_view(projection)
         self.processes.sum(self.statistics[:3])

@@ -201,7 +201,8 @@ def single_view_coverage(
 
 def tile_pixels(surfels: Mapping[str, Tensor], cameras: Sequence[Camera], extent: Tensor, near: float) -> Tensor:
     """Compute the sides [N, 2], pixels, of tiles of half sides `extent`, in the view where they are largest."""
-    scales, axes = surfels["log_scales"].exp(), tangents(surfels["quats"])
+    scales = surfels["log_scales"].exp()
+    axes = tangents(surfels["quats"])
     return max_projected_extent(surfels["means"], axes, scales, cameras, SUPPORT, near) * (extent / SUPPORT)[:, None]
 
 

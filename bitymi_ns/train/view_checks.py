@@ -49,7 +49,8 @@ def check_points(points: Tensor, colors: Tensor) -> None:
 
 
 def _checked(view: View, name: str) -> View:
-    camera, (height, width) = view.camera, (view.camera.height, view.camera.width)
+    camera = view.camera
+    height, width = camera.height, camera.width
     _check_finite(camera.viewmat, f"{name}.camera.viewmat")
     _check_finite(camera.K, f"{name}.camera.K")
     if min(float(camera.K[0, 0]), float(camera.K[1, 1])) <= 0 or camera.skewed:

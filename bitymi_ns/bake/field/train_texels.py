@@ -113,7 +113,8 @@ def polish_scene(
         return baked.stating(polish=FineTuning(steps=0, views=len(views)))
     started, cpu_started = time.perf_counter(), time.process_time()
     validation, trained = validation_split(views, options.val_every)
-    train, background = train or TrainConfig(), background.to(baked.device)
+    train = train or TrainConfig()
+    background = background.to(baked.device)
     run = _polish_run(baked, trained, background, options, train, progress)
     before = _psnr(run, background, eval_views) if eval_views else math.nan
     stopping = _optimise(run, background, validation, options, train.guard, progress)

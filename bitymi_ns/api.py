@@ -65,7 +65,7 @@ def load_capture(
     Returns:
         views: `Camera`s are world to camera with OpenCV axes (x right, y down, z forward), in pixels; images uint8
             [H, W, 3], or [H, W, 4] with straight alpha; masks [H, W] bool or None.
-        points: [M, 3] of the capture, triangulated where it has none; M may be 0.
+        points: [M, 3] of the capture, triangulated where it has none and kept beside the photographs; M may be 0.
         colors: [M, 3] in [0, 1].
 
     Raises:
@@ -202,7 +202,7 @@ def train_scene(
         seed: of all random numbers.
         refine_poses: on = optimise the cameras, too (`log.cameras`).
         device: to train on.
-        callback: called after each step with its number and the loss, which synchronises a CUDA device.
+        callback: called after each step with the number of steps done and the loss, which synchronises a CUDA device.
 
     Returns:
         The scene on `device`, and the log with the PSNR of `eval_views` and the cameras of `views`: if poses were
@@ -242,7 +242,7 @@ def bake_scene(
         views: the training photographs, on which texels are fine-tuned, with their `correction` if any.
         folder: of the bundle, complete or absent.
         background: [3] color behind the scene; None: black.
-        overwrite: replace an existing bundle.
+        overwrite: replace an existing bundle, which stays if the new one cannot be written.
         options: see `BakeOptions`; None: its defaults, a compact bundle.
         target_mb: limit of all files of a compact bundle, in MB (10^6 bytes); None: the default precision.
 

@@ -94,7 +94,7 @@ def cuda_backend(device: torch.device) -> bool:
 
 
 def module(device: torch.device) -> ModuleType:
-    """Return the kernel module for a device. Raises RuntimeError: there is none; as `load`."""
+    """Return the kernel module for a device. Raises RuntimeError: there is none, or as `load`."""
     if device.type not in ("cpu", "cuda"):
         raise RuntimeError(f"no kernels for device '{device}': move the tensors to the CPU or a CUDA device")
     if cuda_backend(device):
@@ -104,7 +104,8 @@ def module(device: torch.device) -> ModuleType:
 
 
 def lookup(name: str, device: torch.device) -> Any:
-    """Return a function or class of the kernel module for a device. Raises RuntimeError: it lacks it; as `module`."""
+    """Return a function or class of the kernel module for a device. Raises RuntimeError: it has none of that name,
+    or as `module`."""
     kernel_or_class = getattr(module(device), name, None)
     if kernel_or_class is None:
         raise RuntimeError(f"there is no kernel {name} for tensors on '{device}': move them to another device")

@@ -119,8 +119,8 @@ class BakedRenderer:
             for name in images
         }
         self.workspace = workspace or Workspace(device)
-        self._viewmats = torch.empty(views, 4, 4, device=device)
-        self._Ks = torch.empty(views, 3, 3, device=device)
+        self._viewmats = torch.eye(4, dtype=torch.float32, device=device).repeat(views, 1, 1)
+        self._Ks = torch.eye(3, dtype=torch.float32, device=device).repeat(views, 1, 1)
         self._background = None if background is None else background.to(device, torch.float32, copy=True)
         self._use_graph, self._graph = graph, None
         self._resize(0)
@@ -147,7 +147,7 @@ class BakedRenderer:
         if background is not None and self._background is not None:
             self._background.copy_(background)
         self.run()
-        if check and not self.complete():
+        while check and not self.complete():
             self._resize(self.workspace.pairs * 5 // 4)
             self.run()
         return self.images

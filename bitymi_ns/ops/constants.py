@@ -1,4 +1,7 @@
-"""Constants of the formulas and of the kernels' arrays, read from the compiled module (csrc states each once)."""
+"""Constants of the formulas and of the kernels' arrays, read from the compiled module (csrc states each once).
+
+The float64 twins in `ops.reference` state those of the formulas again, as an independent check.
+"""
 
 from typing import Any
 

@@ -15,7 +15,7 @@ class TexelTiles:
     """The surfels' tiles in a texel list [T, 3].
 
     Texel (i, j) of surfel s, i along u and j along v, is row first[s] + j r_u + i; its centre lies at
-    u = (i + 0.5) / r_u * 2e - e, v likewise.
+    u = (i + 0.5) / r_u * 2e - e, v likewise. A tile of 1 x 1 texel is a constant.
     """
 
     first: Tensor  # [N] int64

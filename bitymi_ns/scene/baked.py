@@ -50,7 +50,8 @@ class BakedScene:
         surfels: per-surfel parameters by name (docs/overview.md), float32.
         view_color: a name of `ops.VIEW_COLORS`.
         tiles: [N, 5] int32: x, y, layer, r_u, r_v in texels; r_u = 0: no tile.
-        atlas: [layers, height, width, 4] uint8 or float32 (on a CUDA device float16) on the CPU; None: no residual.
+        atlas: [layers, height, width, 4] uint8 or float32, on the CPU, which a CUDA device draws as float16; None: no
+            residual.
         blocks: [layers, height / 4, width / 4, 16] uint8 on the CPU, the same atlas as BC7 blocks, which a CUDA device
             reads; None: not given. The CPU needs `atlas`.
         offset, scale: residual = offset + scale * value, value = stored / 255 for uint8, stored for float32.

@@ -12,14 +12,15 @@ from bitymi_ns.ops.constants import SUPPORT
 from .camera import Camera
 
 AS_TRAINED = (0.75, 1.5)
-"""Scales between which views are rendered as in training."""
+"""Scales between which views are rendered as in training: photographs, too, show the scene from near and far."""
 SMALLEST, LARGEST = 0.5, 2.0
 """Scales beyond which the pixel footprint follows the view's scale."""
 ONE_SAMPLE, TWO_SAMPLES = 0.6, 1 / 3
 """Smallest scales with one sample per pixel, and with two along each axis."""
 SAMPLE = 0.58
 """Minimum number of samples across a photograph's pixel at smaller scales, within the limits below: coarser ones blur
-edges that the alpha texels of several surfels share."""
+edges that the alpha texels of several surfels share, as the mean transmittance of a stack is not the product of the
+means."""
 MOST_SAMPLES, FEW_PIXELS = 6, 1 << 21  # maximum per pixel along each axis; more up to this number of samples in all
 MOST_PIXELS = 1 << 24  # maximum number of samples of a view
 FARTHEST = (1.0 / 64, 64.0)  # range of scales

@@ -28,7 +28,7 @@ class LossConfig:
     overdraw_weight: NonNegative = 0.0
     """Weight of the loss on the number of fragments per pixel, which decays like the falloff loss; 0 = none."""
     overdraw_start: int = 12_000  # First step with the overdraw loss: earlier, it costs quality.
-    overdraw_stop: int = 27_000  # First step without it again, so that the image settles.
+    overdraw_stop: int = 27_000  # First step without the overdraw loss, so that the image settles.
     overdraw_half: Positive = 0.005
     """Blending weight of a fragment that counts as half a fragment in the overdraw loss."""
     depth_weight: NonNegative = 0.01  # Weight of the depth loss, for captures with depth; 0 = none.
@@ -54,13 +54,13 @@ class DensifyConfig:
     """Split when the mean absolute gradient of the projected centre (NDC) is at least this."""
     dense: Threshold = 0.001  # Surfels larger than this share of the scene extent are split, others cloned.
     prune_opacity: Share = 0.005  # Surfels below this opacity are candidates for pruning.
-    prune_world: Threshold = 0.1  # Surfels larger than this share of the scene extent are candidates, too.
+    prune_world: Threshold = 0.1  # Surfels larger than this share of the scene extent are candidates.
     prune_screen: Threshold = 20.0
     """Surfels with a larger radius on screen, in pixels, are candidates after the first opacity reset."""
     prune_budget: Share = 0.5  # Share of the candidates pruned at each densification, sampled at random.
     opacity_clamp: PositiveShare = 0.8  # Opacities are clamped to this at each densification.
     reset_interval: PositiveCount = 3000  # Steps between opacity resets (until `stop`).
-    min_reset_interval: Count = 1500  # Minimum of that interval, in runs of any length.
+    min_reset_interval: Count = 1500  # Minimum of `reset_interval`, in runs of any length.
     reset_opacity: PositiveShare = 0.01  # Largest opacity after a reset; higher in very short runs.
     final_prune_steps: tuple[int, ...] = (18_000, 21_000, 24_000, 27_000)  # Steps of the final prunes.
     final_prune_opacity: Share = 0.1  # Opacity below which final prunes may remove a surfel.
@@ -138,7 +138,7 @@ class TexelConfig(TexelSteps):
     surfel_rates: Positive = 0.4
     """Surfel rates in the texel stage, as a share of those of a run of the stage's length; cosine decay to 0."""
     mean_rates: Positive = 0.2
-    """Position rates, likewise; as high as `surfel_rates` they would destroy the image."""
+    """Position rates in the texel stage, likewise; as high as `surfel_rates` they would destroy the image."""
     pixels_per_texel: Positive = 0.25
     """Minimum number of pixels of a surfel (summed blending weight, in the view where it covers most) per texel."""
     rendered_pixels_per_texel: Positive = 32.0
@@ -152,7 +152,7 @@ class TexelConfig(TexelSteps):
 class GuardConfig:
     """Rollback of diverged training."""
 
-    rollbacks: Count = 5  # Maximum number; 0 = a loss that is not finite ends the run.
+    rollbacks: Count = 5  # Maximum number of rollbacks; 0 = a loss that is not finite ends the run.
     rates: PositiveShare = 0.3  # Factor of all learning rates at each rollback.
     window: PositiveCount = 300  # Steps over which the loss is averaged.
     min_window: PositiveCount = 20  # Minimum number of steps of a window, in runs of any length.
@@ -163,7 +163,7 @@ class PoseConfig:
     """Pose refinement of the photographs."""
 
     start: Count = 3000  # First step in which poses move.
-    stop: Count = 27_000  # First step in which they are fixed again.
+    stop: Count = 27_000  # First step in which poses are fixed again.
     pixels: Positive = 0.5
     """Length of the first step: image motion if all fragments agree on the direction, in pixels of the current
     resolution; cosine decay to 0."""
@@ -182,7 +182,8 @@ class TrainConfig:
     freeze_every: PositiveCount = 10
     """Interval of the steps that train the texture field after `freeze_after`; 1 = every step."""
     freeze_min_updates: Count = 300
-    """Minimum number of such steps, for which short runs use a smaller interval; below 720 steps nothing is frozen."""
+    """Minimum number of steps after `freeze_after` that train the field, for which short runs use a smaller interval;
+    below 720 steps nothing is frozen."""
     field_warmup: Count = 500  # Steps over which the learning rate of the texture field rises.
     resolution_schedule: Count = 3000
     """Interval at which the image resolution doubles, from a lower one at the start; 0 = full size throughout. Longer

@@ -83,7 +83,7 @@ def photometric(rgb: Tensor, target: Tensor, ssim_weight: float, mask: Tensor | 
 
     Args:
         rgb: [H, W, 3] rendered image.
-        target: [H, W, 3] photograph.
+        target: [H, W, 3] photograph in [0, 1].
         ssim_weight: w; 0 for images smaller than `SSIM_WINDOW`.
         mask: excluded pixels are left out of L1 and equal in both images for SSIM: they have no gradient.
 
@@ -128,7 +128,7 @@ def depth_error(rendered: Tensor, alpha: Tensor, depth: Tensor, mask: Tensor | N
     Args:
         rendered: [H, W, 1] sum of w z, camera z.
         alpha: [H, W, 1] sum of w.
-        depth: [H, W] or [H, W, 1] d; unknown where not finite or not above 0.
+        depth: [H, W] or [H, W, 1] d of any float dtype; unknown where not finite or not above 0.
 
     Returns:
         Scalar; 0 if no depth is known.
@@ -155,7 +155,7 @@ def normal_error(rendered: Tensor, alpha: Tensor, normal: Tensor, mask: Tensor |
     Args:
         rendered: [H, W, 3] sum of w n, camera frame.
         alpha: [H, W, 1] sum of w.
-        normal: [H, W, 3] n in the same frame; unknown where not finite or 0.
+        normal: [H, W, 3] n in the same frame, of any float dtype; unknown where not finite or 0.
 
     Returns:
         Scalar; 0 if no normal is known.

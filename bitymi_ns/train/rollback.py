@@ -2,6 +2,7 @@
 
 Divergence is a field or too many surfels that are not finite, or a window of steps, without those that recover from an
 opacity reset, whose mean photometric loss exceeds that of images of their mean colour and of the initial scene.
+The step count goes on.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def blank_texels(
 
     A surfel without fragments that may have a residual gets one texel. `views`: sample of the `count` training views,
     at full size; cameras and masks are used. `to_come`: number of renders in the texel stage. `fitting`: maximum number
-    of texels, as far as the smallest tiles allow. True: it has reduced them."""
+    of texels, as far as the smallest tiles allow. Returns the field, and whether `fitting` has reduced it."""
     surfels = {name: value.detach() for name, value in scene.surfels.items()}
     cameras = [view.camera for view in views]
     bound = scene.config.weight_bound

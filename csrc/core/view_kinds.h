@@ -38,7 +38,7 @@ struct SphericalVoronoi {
   static constexpr int kLeastTerms = 1, kPresetTerms = 7, kReducedWidth = 6;
   BT_HD static ViewColorWidths widths(int K) { return {3 * K, K, 3 * K}; }
 
-  // c = sum_k softmax_k(tau_k s_k . d) rgb_k, by log-sum-exp.
+  // c = sum_k softmax_k(tau_k s_k . d) rgb_k, by log-sum-exp, so that any temperature is safe.
   template <class S> BT_HD static Vec3<S> color(int K, ViewColorRow<const S> p, Vec3<S> d) {
     const S *sites = p.a, *log_tau = p.b, *rgb = p.c;
     S logits[kMaxTerms], top = S(-1e30);

@@ -51,7 +51,8 @@ template <class S> std::unique_ptr<Binner<S>> binner(const View<S>& view, Bins& 
 template <class S> struct FoundFragments {
   std::vector<int64_t> tile_start, block_start;  // [tiles + 1]
   int64_t total = 0, blocks = 0;
-  // Large, so that unwritten memory costs nothing and freed memory returns to the system. A tile's lie in one.
+  // Chunks are large, so that unwritten memory costs nothing and freed memory returns to the system. A tile's fragments
+  // lie in one.
   struct Chunk {
     static constexpr int64_t kSize = int64_t(1) << 21;
     explicit Chunk(bool first) : memory(allocate(kSize * (2 * sizeof(int32_t) + 5 * sizeof(S)), !first)) {}

@@ -93,7 +93,7 @@ template <class S, class T>
 BT_HD T alpha_vjp(const AlphaPatch<S>& patch, const T (&t)[4], const TexelAxis<T>& x, const TexelAxis<T>& y, T& listed,
                   T& gs, T& gu, T& gv) {
   const T m = texel_lerp(t, x.fraction, y.fraction), sigma = abs_(listed), zero = T(S(0));
-  // m may round differently than when the fragment was written
+  // clamped values pass no gradient; m may round differently than when the fragment was written
   const MaskOf<T> moves = sigma < T(S(kAlphaMax)), uncut_moves = moves & (sigma < m * T(S(kAlphaMax * (1 - 1e-6))));
   const T dm = select(moves, gs * sigma / m, zero);
   gu += select(x.inside, dm * T(texel_density(patch.size[0], patch.extent)) * texel_slope_u(t, y.fraction), zero);

@@ -7,7 +7,8 @@ namespace bt {
 
 // viewmat [4, 4] and K [3, 3] are on the surfels' device. Writes geom [n, kGeom], frames [n, kFrame] and radii [n, 2]
 // (half extents of the level-set box in pixels); rows of invisible surfels are zero. Adds the number of rows that are
-// not finite to broken [1]. `photo_pixel` is that of all uses of the rows; if not 1, of the baked renderer only.
+// not finite to broken [1]. `photo_pixel` must be the same wherever the rows are used; other than 1 it is for the baked
+// renderer only.
 template <class S> struct ProjectForward {
   Surfels<S> surfels;
   const S *viewmat, *K;

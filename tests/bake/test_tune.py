@@ -149,6 +149,14 @@ def test_it_gives_up_without_a_gain(wrong: Reduced, views: list[View], patience:
     statistics = tune_atlas(wrong, views, BACKGROUND, wild, progress).statistics.finetune
     assert (statistics.steps < 40) == (patience == 2) and statistics.steps_asked == 40
     assert told[0] == (1, 40) and told[-1] == (statistics.steps, statistics.steps)
+
+    def interrupt(step: str, done: int, total: int) -> None:
+        if step == "tuning texels" and done == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        tune_atlas(wrong, views, BACKGROUND, OPTIONS, interrupt)
+    assert (wrong.texels == 0.1).all()
     perfect = [View(v.camera, render(wrong, v.camera)) for v in views]
     kept = tune_atlas(wrong, perfect, BACKGROUND, replace(wild, steps=10))
     assert kept.statistics.finetune.best_step == 0

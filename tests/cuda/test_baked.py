@@ -264,6 +264,17 @@ def test_recorded_graph(views: int, device: torch.device) -> None:
         assert torch.equal(renderer.draw(cameras)["rgb"], scene.render_views(cameras)["rgb"])
 
 
+def test_the_default_dtype_does_not_matter(device: torch.device) -> None:
+    scene, camera = textured(50, 7).to(device), front()
+    want = scene.render(camera).rgb
+    torch.set_default_dtype(torch.float64)
+    try:
+        got = scene.render(camera).rgb
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(got, want)
+
+
 @pytest.mark.parametrize("maps", [False, True])
 def test_the_renderer_of_any_camera(maps: bool, device: torch.device) -> None:
     scene = textured(50, 7).to(device)

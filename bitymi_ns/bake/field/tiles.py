@@ -49,8 +49,8 @@ def field_tiles(
     pixels_per_texel: float | None = None,
     progress: Progress = no_progress,
 ) -> Trained:
-    """Drop surfels of a bake without tiles (`prune.drop_unseen`), and make tiles with the values of a field at the
-    texel centres.
+    """Drop the unseen surfels (`prune.drop_unseen`) of a bake that has no tiles yet, and make tiles with the values of
+    a field at the texel centres.
 
     With a tolerance a tile covers the disc in which fragments reach the weight bound; beyond it the field is read at
     the nearest point of the disc. `cameras`: of the training views. `pixels_per_texel`: least number of pixels of the

@@ -105,8 +105,8 @@ def polish_scene(
         background: [3], except in steps where `train.background` changes it.
         eval_views: views of which the gain is stated.
 
-    Returns the bake with `statistics.polish`; unchanged with fewer than `FEWEST_VIEWS` views. Raises ValueError: there
-    is no atlas, view colours are reduced, or an option is out of range."""
+    Returns the bake with `statistics.polish`; with fewer than `FEWEST_VIEWS` views it has 0 steps. Raises ValueError:
+    there is no atlas, view colours are reduced, or an option is out of range."""
     options = options or PolishOptions()
     options.check()
     if len(views) < FEWEST_VIEWS:

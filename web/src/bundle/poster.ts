@@ -33,7 +33,8 @@ export async function loadPoster(source: Source, info: Manifest): Promise<Blob |
 }
 
 export async function loadPreview(source: Source, info: Manifest): Promise<Blob | null> {
-  const [name, type] = info.files.has('preview.jpg') ? ['preview.jpg', 'image/jpeg'] : ['preview.png', 'image/png'];
+  const fits = (name: string) => (info.files.get(name)?.bytes ?? Infinity) <= MOST_BESIDE;
+  const [name, type] = fits('preview.jpg') ? ['preview.jpg', 'image/jpeg'] : ['preview.png', 'image/png'];
   const data = await read(source, info, name, MOST_BESIDE);
   return data && new Blob([data], { type });
 }

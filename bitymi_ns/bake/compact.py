@@ -229,9 +229,8 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | 
 def _search(
     coder: Coder, excess: Callable[[RatePoint], float], progress: Progress, most: float = math.inf
 ) -> tuple[RatePoint, RatePoint]:
-    """Bisect lambda up to `most`, until the excess is 0.9 to 1: the last passing point (at most 1) and the first
-    failing one, or the nearest tried. A finite excess above 0 is about proportional to lambda, and gives the next
-    one."""
+    """Bisect lambda up to `most`, until the excess, about proportional to it, is 0.9 to 1: the last passing point (at
+    most 1) and the first failing one, or the nearest tried."""
     low, high, points = None, None, {}
     lmbda = min(START, most)
     for step in range(_SEARCH):

@@ -108,8 +108,7 @@ def fitted(values: Tensor, size: tuple[int, int]) -> Tensor:
 @torch.no_grad()
 def reduced_tiles(tiles: Tiles, inputs: BakeInput, options: BakeOptions, progress: Progress = no_progress) -> Tiles:
     """Resample every tile to the smallest grid within the tolerance, or to no tile where one colour is within it, by
-    the error of the reconstruction (`weighted_rms`). Grids are tried by their number of texels. The device of `inputs`
-    does the work."""
+    the error of the reconstruction (`weighted_rms`), on the device of `inputs`."""
     opacity, beta = kernel_parameters(inputs.surfels, inputs.transmittance)
     device, parts, done = opacity.device, [], 0
     shown = TileVisibility(opacity, beta, tiles.extent.to(device), inputs.weight_bound)

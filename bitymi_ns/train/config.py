@@ -74,8 +74,7 @@ class DensifyConfig:
     pixels_per_surfel: NonNegative = 150.0
     """Densification stops at one surfel per this many pixels of all training photographs; 0 = no limit."""
     growth: NonNegative = 4.0
-    """Growth to this many times the initial number of surfels is allowed despite `pixels_per_surfel`: a scene needs
-    some to add surfels where its errors are."""
+    """Growth to this many times the initial number of surfels is allowed despite `pixels_per_surfel`."""
     max_surfels: Annotated[Count, tyro.conf.arg(aliases=("--max-surfels",))] = 0
     """Number of surfels that densification grows to, never exceeded, instead of `pixels_per_surfel`; 0 = the thresholds
     decide. The prunes after the last densification leave a quarter to two fifths fewer."""
@@ -204,10 +203,10 @@ class TrainConfig:
     random_points: PositiveCount = 20_000
     """Number of random surfels in the scene box if the capture has no sparse points."""
     exposure: ExposureKind = "auto"
-    """Exposure and white balance of each photograph: gain = a learned factor per channel, affine = a learned 3 x 4
-    matrix, off = no correction, auto = gain if the photographs' differences are explained by gains."""
+    """Learned colour correction of each photograph: gain = a factor per channel, affine = a 3 x 4 matrix, off = none,
+    auto = gain if gains explain the differences of the photographs."""
     refine_poses: RefinePoses = "off"
-    """Poses of the training photographs: on = refined during training, off = fixed."""
+    """Poses of the training photographs: on = refined, off = fixed."""
     poses: PoseConfig = field(default_factory=PoseConfig)
     background: Background = "auto"
     """Background colour in training, also behind images with alpha. auto = random in each step for images with alpha,

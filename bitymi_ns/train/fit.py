@@ -116,7 +116,7 @@ def fit(
     Args:
         views: training views at full size.
         callback: called after each step.
-        eval_steps: numbers of steps after which an entry is logged, also after the last step.
+        eval_steps: numbers of steps after which an entry is logged, beside the last.
     """
     trainer = Trainer(scene, views, config, max_steps)
     clock, log = trainer.training.clock, TrainLog()

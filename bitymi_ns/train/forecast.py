@@ -41,9 +41,8 @@ def expected_surfels(schedule: Schedule, first: int, pixels: float, most: int = 
 
 
 class Forecast:
-    """Time that a run will still take. A step costs in proportion to its pixels and surfels, those of views that it
-    only draws included; a unit of this cost takes as long as in the last steps, scaled by sizes of pictures as measured
-    (`compare_sizes`).
+    """Time that a run will still take. A step costs in proportion to its pixels and surfels, in all views that it
+    draws; a unit of this cost takes as long as in the last steps, scaled by sizes of pictures (`compare_sizes`).
 
     Attributes:
         left: seconds to the end of the run; None before the first steps.

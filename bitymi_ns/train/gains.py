@@ -109,8 +109,7 @@ def _disagreement(logs: Tensor) -> float:
 
 
 def _median(values: Tensor, dim: int) -> Tensor:
-    """Compute the median along a dimension without NaN; NaN if empty. For even counts the mean of the middle two:
-    torch's lower median would overestimate differences between photographs."""
+    """Compute the median along a dimension without NaN; NaN if empty. torch's lower median would be biased."""
     if values.shape[dim] == 0:
         return torch.full_like(values.sum(dim), math.nan)
     return 0.5 * (values.nanmedian(dim).values - (-values).nanmedian(dim).values)

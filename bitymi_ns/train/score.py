@@ -52,8 +52,8 @@ def bad_pixels(rgb: Tensor, target: Tensor, threshold: float, mask: Tensor | Non
 
 
 def _random_signs(like: Tensor, seed: int) -> Tensor:
-    """Draw +1 or -1 for every element of a tensor, the same on every device. A random byte gives eight signs: one
-    number per sign would take longer than a GPU takes to render the view."""
+    """Draw +1 or -1 for every element of a tensor, the same on every device, eight from a random byte: one number per
+    sign would take longer than a GPU takes to render the view."""
     count = like.numel()
     generator = torch.Generator().manual_seed(seed)
     drawn = torch.randint(0, 256, (-(-count // 8),), dtype=torch.int32, generator=generator).to(like.device)

@@ -310,8 +310,8 @@ class Strategy:
         return pruned & ~_lowest(pruned, missing, -opacity_logits)
 
     def _draw(self, weights: Tensor, k: int) -> Tensor:
-        """Sample at most k rows of positive weight without replacement, in proportion to it: those with the smallest
-        Exp(1) / weight; torch.multinomial is limited to 2^24 rows."""
+        """Sample at most k rows in proportion to weights, without replacement: those of the smallest Exp(1) / weight,
+        as torch.multinomial is limited to 2^24 rows."""
         k = min(k, int((weights > 0).sum()))
         race = torch.empty(len(weights), dtype=torch.float64).exponential_(generator=self.generator).to(weights.device)
         return (race / weights).topk(k, largest=False).indices

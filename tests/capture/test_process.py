@@ -4,29 +4,25 @@ import json
 import os
 import resource
 import signal
-import sqlite3
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from bitymi_ns.capture.poses import find_poses
 from bitymi_ns.capture.sfm.job import Job
+from bitymi_ns.capture.sfm.process import rows
 
 Copy = Callable[[str], Path]
 COMMAND = [sys.executable, "-m", "bitymi_ns", "sfm"]
 
 
-def with_features(folder: Path) -> int:
-    """Count the photographs whose features COLMAP has found."""
-    for database in folder.glob(".bitymi/*/database.db"):
-        with suppress(sqlite3.Error), closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as connection:
-            return connection.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0]
-    return 0
+def database(folder: Path) -> Path | None:
+    return next(iter(folder.glob(".bitymi/*/database.db")), None)
 
 
 def started(folder: Path, prepare: Callable[[], object] = lambda: None) -> subprocess.Popen:
@@ -61,11 +57,11 @@ def workers(folder: Path) -> list[str]:
 def test_a_killed_run_leaves_no_process_and_goes_on_where_it_stopped(copied: Copy) -> None:
     folder = copied("killed")
     run = started(folder)
-    wait_for(lambda: with_features(folder) >= 3)
+    wait_for(lambda: (db := database(folder)) is not None and rows(db, "keypoints") >= 3)
     run.kill()
     run.communicate()
     wait_for(lambda: not workers(folder))
-    done = with_features(folder)
+    done = rows(database(folder), "keypoints")
     assert done >= 3
 
     told: list[tuple[str, int]] = []
@@ -80,7 +76,7 @@ def test_a_killed_run_leaves_no_process_and_goes_on_where_it_stopped(copied: Cop
 def test_ctrl_c_ends_it_without_a_traceback(copied: Copy) -> None:
     folder = copied("interrupted")
     run = started(folder)
-    wait_for(lambda: with_features(folder) >= 1)
+    wait_for(lambda: (db := database(folder)) is not None and rows(db, "keypoints") >= 1)
     run.send_signal(signal.SIGINT)
     _, said = run.communicate(timeout=60)
     assert run.returncode == 130 and "interrupted" in said and "Traceback" not in said

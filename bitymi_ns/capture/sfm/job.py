@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from pydantic import TypeAdapter
 
@@ -20,6 +21,12 @@ MODEL = "model"  # in the work folder
 
 MAX_ERROR = 4.0  # of observations, in pixels of the images with features; COLMAP's own limit
 SERIAL = 100  # most photographs that one thread maps, for equal results; for 50, two are no faster
+
+
+class StageProgress(Protocol):
+    """Receiver of the stage, its progress and total, and the database table whose rows count the progress from then."""
+
+    def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None: ...
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,11 @@ import numpy as np
 
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.types import CONTRADICTED
-from bitymi_ns.progress import Progress
 from . import matching, model_checks
-from .job import DATABASE, MAX_ERROR, Job, NoPoses
+from .job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
 from .model_checks import contradicted, drop_unlinked
 
-Mapper = Callable[[Job, Path, Path, Progress], dict[int, pycolmap.Reconstruction]]
+Mapper = Callable[[Job, Path, Path, StageProgress], dict[int, pycolmap.Reconstruction]]
 """Maps a database's features and matches, given a folder for files; returns connected components."""
 ENOUGH = 0.9  # share of the connected photographs in a good global model
 GOOD_ERROR = 1.0  # and its reprojection error, in pixels of the images with features
@@ -27,7 +26,7 @@ LEAST_POINTS = 10  # to start from
 TELLING = 100  # least matches of all pairs that blame the poses
 
 
-def reconstruct(job: Job, database: Path, connected: int, tell: Progress) -> pycolmap.Reconstruction | None:
+def reconstruct(job: Job, database: Path, connected: int, tell: StageProgress) -> pycolmap.Reconstruction | None:
     """Find the best model of the photographs, of which verified pairs connect `connected`; None = none."""
     model = None if job.mapper == "incremental" else _mapped(_global, job, database, tell)
     if job.mapper == "global":
@@ -47,7 +46,7 @@ def better(job: Job, database: Path, *models: pycolmap.Reconstruction | None) ->
     return min(equal, key=lambda m: contradicted(m, database, job.pixel) if len(equal) > 1 else 0.0, default=None)
 
 
-def _mapped(mapper: Mapper, job: Job, database: Path, tell: Progress) -> pycolmap.Reconstruction | None:
+def _mapped(mapper: Mapper, job: Job, database: Path, tell: StageProgress) -> pycolmap.Reconstruction | None:
     """Map, refine the largest component, and drop cameras that its points do not link."""
     with job.scratch() as folder:
         models = mapper(job, database, folder, tell)
@@ -61,7 +60,7 @@ def _mapped(mapper: Mapper, job: Job, database: Path, tell: Progress) -> pycolma
     return model
 
 
-def _global(job: Job, database: Path, folder: Path, tell: Progress) -> dict[int, pycolmap.Reconstruction]:
+def _global(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict[int, pycolmap.Reconstruction]:
     stage = "placing all cameras at once"
     tell(stage, 0, 1)
     options = pycolmap.GlobalPipelineOptions(random_seed=0, num_threads=job.threads)
@@ -76,7 +75,7 @@ def _global(job: Job, database: Path, folder: Path, tell: Progress) -> dict[int,
     return models
 
 
-def _incremental(job: Job, database: Path, folder: Path, tell: Progress) -> dict[int, pycolmap.Reconstruction]:
+def _incremental(job: Job, database: Path, folder: Path, tell: StageProgress) -> dict[int, pycolmap.Reconstruction]:
     stage = "placing one camera after the other"
     placed, total = count(1), len(job.order)
 
@@ -130,7 +129,7 @@ def _filter(model: pycolmap.Reconstruction, pixel: float) -> None:
     model.update_point_3d_errors()
 
 
-def triangulate(job: Job, tell: Progress) -> pycolmap.Reconstruction:
+def triangulate(job: Job, tell: StageProgress) -> pycolmap.Reconstruction:
     """Triangulate points with a job's known poses. Raises NoPoses: hardly any, so the poses may be wrong."""
     database = Path(job.work) / DATABASE
     matching.extract(job, database, tell)

@@ -1,6 +1,5 @@
-"""Extract SIFT features into COLMAP's database, choose pairs of photographs, and match them."""
+"""Extract SIFT features of all photographs into COLMAP's database, choose pairs, and match them."""
 
-import os
 from itertools import combinations
 from pathlib import Path
 
@@ -11,10 +10,8 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from bitymi_ns.capture import pycolmap
 from bitymi_ns.capture.types import SPHERICAL_MODEL
 from bitymi_ns.files import write_file
-from bitymi_ns.progress import Progress
-from .job import PAIRS, CameraGroup, Job
+from .job import PAIRS, CameraGroup, Job, StageProgress
 
-AT_ONCE = 8  # photographs per processor of which features are found before progress is told
 SMALL = 1000  # pixels; photographs with a shorter longer side are doubled
 SPHERICAL_SCALE = 2
 """Factor on `SMALL` and the largest image size for 360-degree pictures, which need features twice as dense."""
@@ -29,10 +26,10 @@ SEQUENCE_NEIGHBOURS = 6
 SEQUENCE_SHARE = 0.8  # least share of consecutive photographs that are among the most alike
 
 
-def extract(job: Job, database: Path, tell: Progress) -> None:
+def extract(job: Job, database: Path, tell: StageProgress) -> None:
     """Extract features of the photographs that have none in the database."""
-    done, total, at_once = 0, len(job.order), AT_ONCE * (os.cpu_count() or 1)
-    tell("finding features", done, total)
+    total = len(job.order)
+    tell("finding features", 0, total, counts="keypoints")
     ids = zip(job.cameras, camera_ids(job, database), strict=True)
     single, groups = {"camera_mode": pycolmap.CameraMode.SINGLE}, []
     for group, camera_id in ids:
@@ -42,11 +39,9 @@ def extract(job: Job, database: Path, tell: Progress) -> None:
         pycolmap.import_images(database, job.images, image_names=group.names, options=reader, **single)
     for group, reader in groups:
         options = {"reader_options": reader, "extraction_options": _extraction(job, group), **single}
-        for start in range(0, len(group.names), at_once):
-            names = group.names[start : start + at_once]
-            pycolmap.extract_features(database, job.images, image_names=names, device=pycolmap.Device.cpu, **options)
-            done += len(names)
-            tell("finding features", done, total)
+        how = {"image_names": group.names, "device": pycolmap.Device.cpu}
+        pycolmap.extract_features(database, job.images, **how, **options)
+    tell("finding features", total, total)
 
 
 def camera_ids(job: Job, database: Path) -> list[int]:
@@ -68,7 +63,7 @@ def _extraction(job: Job, group: CameraGroup) -> pycolmap.FeatureExtractionOptio
     return options
 
 
-def match(job: Job, database: Path, tell: Progress, every: bool = False) -> None:
+def match(job: Job, database: Path, tell: StageProgress, every: bool = False) -> None:
     """Choose pairs, or take `every` one, and match those not matched yet."""
     listed = Path(job.work) / PAIRS
     if every or not listed.exists():
@@ -76,15 +71,15 @@ def match(job: Job, database: Path, tell: Progress, every: bool = False) -> None
         write_file(listed, "".join(f"{job.order[i]} {job.order[j]}\n" for i, j in pairs).encode())
     options = pycolmap.ImportedPairingOptions(match_list_path=listed)
     total = len(listed.read_text("utf8").splitlines())
-    tell("comparing photographs", 0, total)
+    tell("comparing photographs", 0, total, counts="two_view_geometries")
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
     settings = {"pairing_options": options, "verification_options": verification}
-    pycolmap.match_image_pairs(database, **settings, device=pycolmap.Device.cpu)  # in one call, for equal results
+    pycolmap.match_image_pairs(database, **settings, device=pycolmap.Device.cpu)
     tell("comparing photographs", total, total)
 
 
-def choose(job: Job, database: Path, tell: Progress) -> list[tuple[int, int]]:
+def choose(job: Job, database: Path, tell: StageProgress) -> list[tuple[int, int]]:
     """Choose pairs of indices into `job.order`, the smaller one first."""
     count = len(job.order)
     if job.matching == "exhaustive" or (job.matching == "auto" and count <= FEW):
@@ -101,7 +96,7 @@ def choose(job: Job, database: Path, tell: Progress) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def likeness(job: Job, database: Path, tell: Progress) -> np.ndarray:
+def likeness(job: Job, database: Path, tell: StageProgress) -> np.ndarray:
     """Count the largest features [n,n] that pairs of photographs share; 0 on the diagonal."""
     count = len(job.order)
     size = COARSE_FEATURES[count > MANY]

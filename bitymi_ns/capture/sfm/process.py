@@ -4,8 +4,11 @@ import json
 import os
 import re
 import shutil
+import sqlite3
 import subprocess
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,7 @@ LITTLE_SPACE = 50_000_000  # free bytes that count as a full disk
 def run(job: Job, source: Path, progress: Progress) -> dict[str, Any]:
     """Run a job, and return the worker's result. Raises CaptureError: there are no poses, or COLMAP failed."""
     work = Path(job.work)
+    watching = ExitStack()
     with open(work / LOG, "wb", opener=no_links) as log:
         streams = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": log}
         how = {"text": True, "encoding": "utf8", "env": {**os.environ, "PYTHONUNBUFFERED": "1"}}
@@ -38,13 +42,45 @@ def run(job: Job, source: Path, progress: Progress) -> dict[str, Any]:
                     raise CaptureError(f"no {wanted} can be found in {source}: {line['failure']}")
                 if "result" in line:
                     return line["result"]
+                watching.close()
                 progress(line["stage"], line["done"], line["total"])
+                if line["counts"]:
+                    watched = _watched(work / DATABASE, line["counts"], progress, line["stage"], line["total"])
+                    watching.enter_context(watched)
         except BrokenPipeError:
             pass
         finally:
+            watching.close()
             process.kill()
             process.wait()
     raise CaptureError(_why_ended(work, source, process.returncode))
+
+
+@contextmanager
+def _watched(database: Path, table: str, progress: Progress, stage: str, total: int) -> Iterator[None]:
+    """Report the rows of a table while COLMAP fills it. They are counted in this process: COLMAP's SQLite and Python's
+    in one process would release each other's file locks."""
+    ended = threading.Event()
+
+    def watch() -> None:
+        while not ended.wait(0.5):
+            progress(stage, min(rows(database, table), total), total)
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
+def rows(database: Path, table: str) -> int:
+    """Count the rows of a table; 0 if it cannot be read."""
+    where = f"{database.absolute().as_uri()}?mode=ro"
+    with suppress(sqlite3.Error), closing(sqlite3.connect(where, uri=True, timeout=5)) as connection:
+        return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
+    return 0
 
 
 def delete_work(work: Path, *folders: str) -> None:

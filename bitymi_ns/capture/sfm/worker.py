@@ -1,5 +1,5 @@
-"""Run COLMAP in this process: a Job on stdin, lines of JSON on stdout, {"stage", "done", "total"}, or at the end
-{"result"} or {"failure"}. The process ends with its stdin. Prints of libraries go to stderr."""
+"""Run COLMAP in this process: a Job on stdin, lines of JSON on stdout, {"stage", "done", "total", "counts"}, or
+at the end {"result"} or {"failure"}. The process ends with its stdin. Prints of libraries go to stderr."""
 
 import json
 import os
@@ -28,11 +28,11 @@ class Stages:
         self._since = time.monotonic()
         self._stage = "starting"
 
-    def __call__(self, step: str, done: int, total: int) -> None:
+    def __call__(self, stage: str, done: int, total: int, counts: str = "") -> None:
         now = time.monotonic()
         self.seconds[self._stage] = self.seconds.get(self._stage, 0.0) + now - self._since
-        self._stage, self._since = step, now
-        send(stage=step, done=done, total=total)
+        self._stage, self._since = stage, now
+        send(stage=stage, done=done, total=total, counts=counts)
 
 
 def send(**line: object) -> None:

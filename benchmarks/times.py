@@ -45,7 +45,8 @@ def gpu() -> torch.device:
 
 def device_milliseconds(run: Run, runs: int) -> float:
     """Measure the median time of a call on the GPU, after ten untimed ones. Calls are queued behind a spin of the
-    device that outlasts the queueing, so that launches are not measured."""
+    device that outlasts the queueing, so that launches are not measured; synchronisations within a call
+    are."""
     for _ in range(10):
         run()
     torch.cuda.synchronize()
@@ -192,7 +193,7 @@ def kernels(
         device: cpu or cuda.
         surfels: Size of the scene.
         size: Width and height of the image.
-        sections: What to run.
+        sections: What to run; all by default.
         times: Timed runs, after five untimed ones; 0 = run once, for sanitizers.
     """
     place = gpu() if device == "cuda" else CPU

@@ -31,11 +31,11 @@ Flag = tyro.conf.FlagCreatePairsOff[bool] if hasattr(tyro.conf, "FlagCreatePairs
 class Sample:
     """Ray-trace a small room and write it as a nerfstudio capture: images, exact cameras and sparse points."""
 
-    output_dir: Path  # Folder to write, empty.
+    output_dir: Path  # Folder to write; missing or empty.
     views: int = 60  # Number of images.
     width: int = 320  # Image width in pixels.
     height: int = 240  # Image height in pixels.
-    seed: int = 0  # Of textures, camera path and points.
+    seed: int = 0  # Seed of textures, camera path and points.
     points: int = 8000  # Number of sparse points.
     overwrite: Flag = False  # Replace the folder if it holds something.
 

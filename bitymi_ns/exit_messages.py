@@ -88,7 +88,7 @@ def run(command: Callable[[], int]) -> int:
             sys.stdout.flush()
     except BrokenPipeError:
         with suppress(OSError, ValueError):  # stdout may be no file
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes again at exit
         return NO_READER
     except (KeyboardInterrupt, Exception) as error:
         line = line_of(error)

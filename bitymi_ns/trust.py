@@ -33,13 +33,21 @@ def no_links(name: str | os.PathLike[str], flags: int) -> int:
     """Open or create a file for writing, as an opener for `open`. Raises Refused: it is a symbolic or hard link, is no
     regular file, or belongs neither to the user nor to the folder's owner."""
     path = Path(name)
-    how = (flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK) & ~(os.O_EXCL | os.O_TRUNC)
-    try:
-        file = os.open(path, how, 0o666)  # does not block on a pipe
-    except OSError as error:
-        if path.is_symlink():
-            raise Refused(f"{path} is a link, which is not followed: remove it", path) from error
-        raise
+    how = (flags | os.O_NOFOLLOW) & ~(os.O_CREAT | os.O_EXCL | os.O_TRUNC)
+    while True:
+        try:
+            return os.open(path, how | os.O_CREAT | os.O_EXCL, 0o666)  # of any owner that the file system gives it
+        except FileExistsError:
+            pass
+        try:
+            file = os.open(path, how | os.O_NONBLOCK)  # does not block on a pipe
+            break
+        except FileNotFoundError:  # removed in the meantime
+            continue
+        except OSError as error:
+            if path.is_symlink():
+                raise Refused(f"{path} is a link, which is not followed: remove it", path) from error
+            raise
     try:
         found = os.fstat(file)
         if not stat.S_ISREG(found.st_mode):
@@ -164,7 +172,9 @@ def leads_inside(name: str) -> bool:
 
 
 def finite_numbers(values: Mapping[str, Any]) -> dict[str, float]:
-    numbers = {key: value for key, value in values.items() if type(value) in (int, float)}
+    numbers = {
+        key: value for key, value in values.items() if isinstance(value, (int, float)) and not isinstance(value, bool)
+    }
     return {key: float(value) for key, value in numbers.items() if abs(value) <= sys.float_info.max}
 
 
@@ -212,5 +222,6 @@ def is_text(name: str | os.PathLike[str]) -> bool:
 def python_command(module: str, function: str) -> list[str]:
     """Build a command that calls a function in a new process of this Python; the function returns the exit status, and
     further words of the command are in `sys.argv`. The current folder, which may be an untrusted capture, is removed
-    from the search path (as by `-P`, which Python 3.10 lacks)."""
+    from the search path: with `-m` or `-c` alone a `json.py` in it would be run. `-P` does the same, but Python 3.10
+    lacks it; `-I` would also hide the user's own packages."""
     return [sys.executable, "-c", _CALL.format(module, function)]

@@ -118,7 +118,7 @@ def _read(path: Path, photograph: tuple[int, int], alike: bool = True) -> npt.ND
             fail(wrong_size(path, size, photograph))
         if max(size[0] / photograph[0], size[1] / photograph[1]) > MOST_LARGER or math.prod(shape) > MOST_NUMBERS:
             declares = f"{path} declares {' x '.join(map(str, shape))} numbers for a photograph of"
-            limits = f"at most {MOST_LARGER} times its sides, and {MOST_NUMBERS:,}, are read"
+            limits = f"at most {MOST_LARGER} times its sides, and {MOST_NUMBERS:,} numbers, are read"
             fail(f"{declares} {photograph[0]} x {photograph[1]} pixels: {limits}. {_WITHOUT}")
 
     with parsing(path, _WITHOUT):

@@ -117,8 +117,18 @@ def check_photographs_exist(source: Path, files: Iterable[Path]) -> None:
     if not missing:
         return
     shown = "\n  ".join(f"{file}{_hint(source.parent, file, names)}" for file in missing[:3])
-    advice = "Copy them there, correct the names or remove the frames."
+    advice = f"Copy them there, correct the names or remove the frames.{_smaller_copies(missing)}"
     fail(f"{len(missing)} of {len(names)} photographs of {source} are missing:\n  {shown}\n{advice}")
+
+
+def _smaller_copies(files: Iterable[Path]) -> str:
+    """Say how to use copies of missing photographs in a folder such as `images_2`; empty = there are none."""
+    for file in files:
+        for factor in (2, 4, 8, 16):
+            folder = file.parent.with_name(f"{file.parent.name}_{factor}")
+            if os.path.isfile(folder / file.name):
+                return f" Or use their copies in {folder}: `bitymi-data --downscale-factor {factor}`."
+    return ""
 
 
 def name_unused(found: Found, used: Iterable[Path | None], masks: Iterable[Path | None], downscale: int | None) -> None:

@@ -70,7 +70,7 @@ def read_transforms(path: Path, own_format: bool, need_photos: bool, use_masks: 
         _check_applied(path, meta)
         for key in [key for key in LISTS if key in meta]:
             if not isinstance(meta[key], list) or not all(isinstance(name, str) for name in meta[key]):
-                fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it.")
+                fail(f"{path}: {key} is {repr(meta[key])[:60]}, not a list of names. Correct it or remove it.")
         correct_poses(path, meta["frames"])
     frames = meta["frames"]
     lists = {split: meta.pop(key) for key, split in LISTS.items() if key in meta}
@@ -81,7 +81,7 @@ def read_transforms(path: Path, own_format: bool, need_photos: bool, use_masks: 
     maps = find_files.find_maps(path, frames, need_photos)
     cloud = meta.get("ply_file_path")
     if cloud is not None and (not isinstance(cloud, str) or not cloud):
-        fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it.")
+        fail(f"{path}: ply_file_path is {cloud!r}, not the name of a file. Correct it or remove it.")
     if cloud and not os.path.isfile(path.parent / cloud):
         there = find_files.FileFinder(path.parent, extensions=(".ply",)).find(cloud)
         meta["ply_file_path"] = cloud if there is None else there.relative_to(path.parent).as_posix()
@@ -164,7 +164,7 @@ def check_number(path: Path, key: str, value: Any, label: str) -> float | int:
     except (TypeError, ValueError, OverflowError):
         fail(f"{path}: {key} {label} is {value!r}, which is no number")
     if key.endswith("_scale") and not 0.0 < number < math.inf:
-        fail(f"{path}: {key} is {value!r}, which is no positive number. Correct it.")
+        fail(f"{path}: {key} is {value!r}, which is no positive number. Correct it or remove it.")
     if key not in ("w", "h"):
         return number  # what is not finite is refused with the cameras
     if not number.is_integer() or not 1 <= number <= MAX_SIDE:

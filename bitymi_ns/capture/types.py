@@ -113,7 +113,7 @@ class Photograph:
     label: str  # names the camera in messages
     mask: Path | None = None
     downscaled: bool = False  # `file` is a downscaled copy
-    frame: int | None = None  # of a rig that took several together
+    frame: int | None = None  # shared by photographs that a rig took together; None = it stands alone
     maps: MapFiles = MapFiles()
 
 
@@ -168,8 +168,9 @@ class SfmOptions(SfmSettings):
 @dataclass(frozen=True)
 class FoundPoses:
     model: Path
-    """Folder of a COLMAP model in full-size pixels of `images`, distorted as they are."""
-    images: Path  # Folder of the photographs, upright copies or frames.
+    """Folder of a COLMAP model in full-size pixels of `images`, distorted as they are; frame.json in `report` states
+    its up and metres."""
+    images: Path  # Folder that image names are relative to: of the photographs, of upright copies or of frames.
     report: Path  # Folder with report.json, cameras.png and frame.json.
     left_out: dict[str, str]  # Photographs that have no pose, by name, and why.
     registered: int  # Number of photographs that have a pose.

@@ -173,9 +173,9 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
 def hand_over(ours: Any, path: Path, state: dict[str, Any], check: Callable[[Any], None] | None = None) -> None:
     """Have eval_setup load `state`, read from `path`, for the configuration `ours`, and `check` the pipeline.
 
-    Changes: `eval_load_checkpoint` in eval_utils, once. For: as above. Without: nerfstudio reads the file by
-    torch.load, which can run code of others, and no bundle opens. Superfluous once eval_setup asks the method for its
-    state.
+    Changes: `eval_load_checkpoint` in eval_utils, once. For: as `answer_checkpoint_dir`. Without: nerfstudio reads
+    the file by torch.load, which can run code of others, and no bundle opens. Superfluous once eval_setup asks the
+    method for its state.
     """
     from nerfstudio.utils import eval_utils
 
@@ -234,8 +234,8 @@ def _find_bundle(recorded: Path, evaluated: Path | None) -> Path:
 def moved_capture(datamanager: Any) -> None:
     """Read the capture at the environment variable `DATA`, if it is set.
 
-    Changes: the recorded path. For: as above. Without: runs and bundles are lost when their capture moves. Superfluous
-    once these commands have an option --data.
+    Changes: the recorded path. For: as `answer_checkpoint_dir`. Without: runs and bundles are lost when their capture
+    moves. Superfluous once these commands have an option --data.
     """
     if not os.environ.get(DATA):
         return

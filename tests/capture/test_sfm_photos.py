@@ -5,7 +5,7 @@ import pytest
 from PIL import Image, ImageFilter
 
 from bitymi_ns.capture.folder_contents import photo_folder
-from bitymi_ns.capture.image_files import in_srgb
+from bitymi_ns.capture.image_files import in_srgb, read_image
 from bitymi_ns.capture.sfm_photos import blurred, duplicates, find_photos, natural, read_photo, read_photos, upright
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.progress import no_progress
@@ -111,7 +111,8 @@ def test_a_file_that_is_not_what_its_name_says_is_converted(tmp_path: Path, name
 
 def test_colors_of_another_profile_are_those_of_screens(tmp_path: Path) -> None:
     Image.new("RGB", (64, 64), (200, 100, 80)).save(tmp_path / "a.webp", lossless=True, icc_profile=DISPLAY_P3)
-    assert upright(read_photo(tmp_path, "a.webp")).getpixel((9, 9))[0] > 205
+    for image in (upright(read_photo(tmp_path, "a.webp")), read_image(tmp_path / "a.webp")):
+        assert image.getpixel((9, 9))[0] > 205
     pixels = np.full((4, 4, 4), (200, 100, 80, 60), np.uint8)
     for mode in ("RGB", "RGBA"):
         image = Image.fromarray(pixels[..., : len(mode)])

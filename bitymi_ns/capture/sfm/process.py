@@ -104,7 +104,7 @@ def _why_ended(work: Path, source: Path, code: int) -> str:
         return f"{work} cannot be written: {full_disk}. Free some space, and start again: what is done is kept"
     if "database disk image is malformed" in log:
         delete_work(work)
-        return f"{work} was damaged, and has been emptied: start again"
+        return f"features and matches kept in {work} were damaged and have been removed: start again"
     if code in (-9, 137):
         killed = f"the finding of poses of {source} was killed: the machine may have run out of memory"
         return f"{killed}. Start again, it goes on; a smaller max_image_size needs less"

@@ -45,7 +45,7 @@ def build(inputs: Sequence[Path], output_dir: Path, title: str = "bitymi report"
     missing or broken, nothing usable was found, or the report cannot be written.
 
     `inputs`: ns-eval JSON files, training curves (JSONL with `step` and any of `seconds`, `cpu_seconds`, `surfels`,
-    `psnr`), cells of `bitymi bench`, PNG images of ns-eval, and folders to search for these."""
+    `fragments`, `psnr`), cells of `bitymi bench`, PNG images of ns-eval, and folders to search for these."""
     output_dir = Path(os.path.expanduser(output_dir)).absolute()
     page = output_dir / PAGE
     with write_errors_as(output_dir, ReportError):

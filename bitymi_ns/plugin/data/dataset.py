@@ -157,9 +157,9 @@ def drop_blank_views(outputs: DataparserOutputs, split: str) -> DataparserOutput
     if not blank:
         return outputs
     which = f"{len(masks)} {split} photographs exclude every pixel"
-    if split == "training" and len(blank) == len(masks):
-        fail(f"the masks of all {which}. Pixels count where the mask is not black: invert inverted masks.")
     named = listed([outputs.image_filenames[i] for i in blank])
+    if split == "training" and len(blank) == len(masks):
+        fail(f"the masks of all {which}: {named}. Pixels count where the mask is not black: invert inverted masks.")
     warn(f"The masks of {len(blank)} of {which}: {named}. These views are left out.")
     return select_views(outputs, [i for i in range(len(masks)) if i not in blank])
 

@@ -48,9 +48,9 @@ class MeshScene(NamedTuple):
 class ExportMesh(SurfaceOptions):
     """Extract the surface as a triangle mesh with vertex colors: TSDF fusion of median depths (open3d)."""
 
-    load_config: Path  # config.yml of a trained scene, or a bundle.
+    load_config: Path  # config.yml of a trained scene or of a bundle, or a bundle in one file.
     output_dir: Path  # Folder of the mesh: mesh.ply, mesh.glb or mesh.obj.
-    format: MeshFormat = "ply"  # Files of other formats stay.
+    format: MeshFormat = "ply"  # Format of the file; files of other formats stay.
     frame: Frame = "capture"
     """Frame of the vertices: the capture's, in its unit of length, or the scene's, in which nerfstudio trains."""
     crop: bool = False  # Leave out the surfels that the bundle's notes.json hides.

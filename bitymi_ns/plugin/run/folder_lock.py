@@ -58,7 +58,7 @@ def keep_poses_report(folder: Path, report: Path | None, source: Source | None =
             if source is not None and origin is not None:
                 write_kept_poses(new, source, origin)
     except OSError as error:
-        loss = "" if origin is None else " Nor are the poses: leave the photographs as they are."
+        loss = "" if origin is None else " Nor are the poses: leave the photographs as they are while you use the run."
         warn(f"The report on the poses is not kept with the run: {files.reason(error, folder)}.{loss}")
 
 

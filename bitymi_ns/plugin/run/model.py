@@ -205,9 +205,10 @@ def new_scene(
     xyz = xyz.float()
     declared = None if scene_box is None or not facts.declares_box else _corners(scene_box)
     box = None
+    advice = "remove ply_file_path from transforms.json to start from random points."
     if not bool(torch.isfinite(xyz).all(1).any()):
         if len(xyz):
-            fail(f"all {len(xyz)} points of the capture are NaN or infinite. Make them again, or remove them.")
+            fail(f"all {len(xyz)} points of the capture are NaN or infinite. Make them again, or {advice}")
         box = None if scene_box is None else _corners(scene_box)
     many, started = len(xyz) >= MANY_POINTS, time.perf_counter()
     if many:
@@ -226,10 +227,11 @@ def new_scene(
         say(f"{report.background:,} more surfels start where the photographs show no point.")
     usable = report.given - report.not_finite - report.duplicates
     if 0 < usable < FEW_POINTS:
-        warn(f"The capture has only {usable} different points. If little appears, start without (ply_file_path).")
+        warn(f"The capture has only {usable} different points. If little appears, {advice}")
     if report.not_finite:
         row = int(torch.nonzero(~torch.isfinite(xyz).all(1))[0])
-        warn(f"{report.not_finite} of {report.given} points of the capture are not finite and left out, first {row}.")
+        what = f"{report.not_finite} of {report.given} points of the capture are not finite"
+        warn(f"{what} (the first is point {row}); they are left out.")
     return scene
 
 

@@ -48,8 +48,8 @@ class LpipsUnavailable(RuntimeError):
 
 def lpips(image: Tensor, reference: Tensor, backbone: str) -> float:
     """Measure LPIPS of two images [H, W, 3] float in [0, 1], of `LEAST_SIDE` pixels or more along each side, averaged
-    over pixels. Backbone "alex" is AlexNet fed with [-1, 1], as the package lpips, nerfstudio and gsplat do; "vgg" is VGG16 fed with [0, 1],
-    as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable."""
+    over pixels. Backbone "alex" is AlexNet fed with [-1, 1], as the package lpips, nerfstudio and gsplat do; "vgg" is
+    VGG16 fed with [0, 1], as 3D Gaussian Splatting's code and later papers do. Raises LpipsUnavailable."""
     weights = _on_device(backbone, str(image.device))
     pair = torch.stack([image, reference]).permute(0, 3, 1, 2).float()
     if backbone == "alex":

@@ -84,9 +84,8 @@ def test_the_command_prints_the_tables_and_skips_what_is_done(
 def test_a_plan_gives_methods_options_and_bundles(fakes, capture: Callable[[str], Path], tmp_path: Path) -> None:
     words = ["local", "--data", capture("fox"), "--steps", 10, "--plan", "overdraw", "--extra=--a.b 1"]
     assert run(*words, "--work", tmp_path / "w") == 0
-    trained, exported = (
-        [call for call in fakes.calls() if call.startswith(name)] for name in ("ns-train", "ns-export")
-    )
+    calls = fakes.calls()
+    trained, exported = ([call for call in calls if call.startswith(name)] for name in ("ns-train", "ns-export"))
     assert len(trained) == len(exported) == 6 and all("--a.b 1" in call for call in trained)
     assert sum("overdraw-weight 0.006 " in call for call in trained) == 1
     assert sum(call.startswith("ns-train bitymi-fast") for call in trained) == 2

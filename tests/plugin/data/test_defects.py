@@ -182,6 +182,8 @@ TRANSFORMS: list[tuple[Change, str]] = [
     (frame(2, mask_path="\\\\"), r"mask_path of frame 2 is '.*', not the name of a file"),
     (entry(lambda meta: [f.update(mask_path=f"/home/me/masks/{f['file_path']}") for f in meta["frames"]]),
      "12 of 12 masks .* are missing: /home/me/masks/images/frame_"),
+    (lambda path: (reduce_photographs(path.parent, 2, (24, 18)), shutil.rmtree(path.parent / "images")),
+     "use their copies in .*images_2: `bitymi-data --downscale-factor 2`"),
 ]  # fmt: skip
 NOT_JSON = r"transforms.json cannot be read: Expecting .*line \d+ .*Correct it there \(JSON has neither comments"
 IMAGES = "images.txt cannot be read: "

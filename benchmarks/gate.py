@@ -121,7 +121,8 @@ class Calibration:
 def run_seed(capture: SplitCapture, seed: int, calibration: Calibration) -> Figures:
     """Measure the figures of one seed."""
     config, background = TrainConfig(seed=seed), torch.zeros(3)
-    views, cameras = [*capture.train, *capture.held_out], [view.camera for view in capture.train]
+    views = [*capture.train, *capture.held_out]
+    cameras = [view.camera for view in capture.train]
     scene = scene_for_views(capture.train, capture.points, capture.colours, SceneConfig(texture="texels"), config)
     train = partial(fit, scene, capture.train, [], config, SETTINGS["steps"], callback=calibration.every(10))
     _, training = calibration.timed(train)

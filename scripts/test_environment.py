@@ -71,7 +71,8 @@ def interpreter_of(version: str) -> str:
 
 def try_commands(environment: Environment, data: Path | None) -> None:
     """Train a capture or the sample room, go on with the run, evaluate and export it."""
-    folder, train = environment.folder, ["bitymi", "--vis", "tensorboard", "--output-dir", "runs", "--timestamp", "run"]
+    folder = environment.folder
+    train = ["bitymi", "--vis", "tensorboard", "--output-dir", "runs", "--timestamp", "run"]
     if data is None:
         data = folder / "room"
         environment.run("bitymi", "sample", "--output-dir", data)

@@ -35,7 +35,9 @@ _PHOTOGRAPH = re.compile(r"photograph-[0-9]{4,6}\.jpg")
 _PART = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 # Records of a ZIP: a part's header, a row of the directory; ZIP64 end of directory, its locator, end of directory.
 _LOCAL, _CENTRAL = struct.Struct("<4s22xHH"), struct.Struct("<4s6xH8xLLHHH8xL")
-_LARGE, _LARGE_AT, _END = struct.Struct("<4s36xQQ"), struct.Struct("<4s4xQ4x"), struct.Struct("<4s8xLLH")
+_LARGE = struct.Struct("<4s36xQQ")
+_LARGE_AT = struct.Struct("<4s4xQ4x")
+_END = struct.Struct("<4s8xLLH")
 _WIDE = 0xFFFFFFFF  # a number that stands in the row's ZIP64 field
 _SLACK = 64  # most bytes by which a part's header is longer than 30 and its name
 

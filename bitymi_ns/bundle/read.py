@@ -204,7 +204,9 @@ def assemble(folder: Path, info: Manifest, files: dict[str, bytearray], decode: 
         **contents(folder, info, files, decode),
     )
     if atlas is not None:
-        scene.offset, scene.scale, scene.alpha_scale = atlas.offset, atlas.scale, atlas.alpha_scale or 0.0
+        scene.offset = atlas.offset
+        scene.scale = atlas.scale
+        scene.alpha_scale = atlas.alpha_scale or 0.0
     cameras = parse_cameras(files[CAMERAS], folder / CAMERAS) if CAMERAS in files else []
     return Bundle(scene, info, cameras)
 

@@ -62,7 +62,8 @@ def joined(bundle: str | Path) -> tuple[bytes, SingleFile]:
     first, buffer = 0, io.BytesIO()
     with parts_of(bundle, inside=True) as parts:
         info = manifest_of(parts)
-        needed, there = 2 * sum(info.files[name].bytes for name in _names(info)), machine_memory()
+        needed = 2 * sum(info.files[name].bytes for name in _names(info))
+        there = machine_memory()
         if needed > there:
             why = f"that takes {size_text(needed)} of memory, this machine has {size_text(there)}"
             raise BundleError(f"{parts.bundle} cannot be packed: {why}")

@@ -27,7 +27,8 @@ def check_head(info: Manifest, name: str, head: bytes, size: int) -> None:
     surfels, atlas = info.surfels, info.atlas
     if name == SURFELS:
         elements = ply.header_of(head, size).elements
-        count, terms = elements["vertex"].count, elements[TERMS].count if TERMS in elements else None
+        count = elements["vertex"].count
+        terms = elements[TERMS].count if TERMS in elements else None
         if count != surfels.count:
             raise ply.PlyError(f"it has {count} surfels, surfels.count of {MANIFEST} says {surfels.count}")
         if terms != surfels.terms:

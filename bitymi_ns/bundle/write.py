@@ -210,7 +210,10 @@ def _check_alpha(scene: BakedScene, atlas: Atlas | None, codes: SceneCodes | Non
 
 
 def _check_surfels(scene: BakedScene) -> None:
-    surfels, tiles, kind, mean_residual = scene.surfels, scene.tiles, scene.view_color, scene.mean_residual
+    surfels = scene.surfels
+    tiles = scene.tiles
+    kind = scene.view_color
+    mean_residual = scene.mean_residual
     if "view_terms" in surfels:
         try:
             check_reduced(kind, surfels, len(tiles))

@@ -65,7 +65,8 @@ def find_source(found: Found, images: Path | None, downscale: int, need_photos: 
     model = read_model(found.path)
     names = [image.name for image in model.images]
     photographs = _find_folder(names, found.path, found.folder, images, downscale, need_photos)
-    factor, camera = photographs.name.rpartition("_")[2], model.cameras[model.images[0].camera_id]
+    factor = photographs.name.rpartition("_")[2]
+    camera = model.cameras[model.images[0].camera_id]
     size = image_size(photographs / names[0]) if need_photos and factor.isdecimal() else None
     if size is not None and size != camera.size and in_proportion(size, camera.size) and factor != str(downscale):
         what = f"only copies of {size[0]} x {size[1]} pixels of the photographs of {found.path} are there, in"

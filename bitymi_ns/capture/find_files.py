@@ -134,7 +134,8 @@ def _smaller_copies(files: Iterable[Path]) -> str:
 def name_unused(found: Found, used: Iterable[Path | None], masks: Iterable[Path | None], downscale: int | None) -> None:
     """Report pictures that are neither `used` nor `masks` nor copies smaller by `downscale`."""
     named, masked = ({Path(os.path.normpath(path)) for path in paths if path is not None} for paths in (used, masks))
-    folder, copies = Path(os.path.normpath(found.folder)), None if downscale is None else f"_{downscale}"
+    folder = Path(os.path.normpath(found.folder))
+    copies = None if downscale is None else f"_{downscale}"
     models = {images: model for model in models_in(folder) for images in images_of(folder / model)}
     if left := passed_over(folder, named, copies, masked, models):
         say(f"Not taken for photographs in {found.folder}: {listed(left, most=12)}.")

@@ -158,7 +158,9 @@ def passed_over(
     they are. Folders whose names end in `copies` (as `images_2`) do not count."""
     among = None if used is None else {above for path in used for above in path.parents}
     groups: dict[tuple[Kind | None, Path, str], list[Path]] = defaultdict(list)
-    described, known, masked = [], {*(used or ()), *masks}, {above for mask in masks for above in mask.parents}
+    described = []
+    known = {*(used or ()), *masks}
+    masked = {above for mask in masks for above in mask.parents}
     for path, kind in look_in(folder, among):
         if kind in kinds.OF_MASKS and (path if path.is_dir() else path.parent) in masked:
             continue
@@ -211,7 +213,8 @@ def images_of(model: Path) -> list[Path]:
 
 def refusal(folder: Path) -> str:
     """Say what to do with a bundle or a run; empty = it is neither."""
-    what, give = result_in(folder) if folder.is_dir() else None, "give the folder of its photographs"
+    what = result_in(folder) if folder.is_dir() else None
+    give = "give the folder of its photographs"
     if what is kinds.BUNDLE:
         return f"{folder} is a bundle, not a capture: {give}. `bitymi view {folder}` shows the bundle."
     if what is kinds.RUN:
@@ -228,7 +231,8 @@ def poses_in(folder: Path) -> tuple[str, ...]:
                 files[kind].append(path)
     described = []
     for kind, paths in files.items():
-        names, use = listed([path.relative_to(folder) for path in paths], most=1), _use(kind)
+        names = listed([path.relative_to(folder) for path in paths], most=1)
+        use = _use(kind)
         for word, path in (("FILE", paths[0]), ("IMAGES", photo_folder(folder)), ("FOLDER", folder)):
             use = use.replace(word, shlex.quote(str(path)))
         described.append(f"{names} ({kind.what}{use})")

@@ -85,14 +85,17 @@ def move_to_world(
     local, origin = local_positions(gps)
     centers = {i.name: i.projection_center() for i in model.images.values() if i.has_pose}
     names = [name for name in centers if name in local]
-    placed, positions = np.array([centers[n] for n in names]), np.array([local[n] for n in names])
+    placed = np.array([centers[n] for n in names])
+    positions = np.array([local[n] for n in names])
     if (by_gps := _by_gps(placed, positions)) is not None:
         similarity, agree = by_gps
-        source, by_phones = "gps", None if up is None else similarity.rotation.matrix() @ up
+        source = "gps"
+        by_phones = None if up is None else similarity.rotation.matrix() @ up
         if by_phones is not None and by_phones @ UP > STEEPEST:
             turn, _ = Rotation.align_vectors(UP, by_phones)
             turn = pycolmap.Rotation3d(turn.as_matrix())
-            source, similarity = "gravity", pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
+            source = "gravity"
+            similarity = pycolmap.Sim3d(1.0, turn, np.zeros(3)) * similarity
         model.transform(similarity)
         error = float(np.median(_gps_errors(similarity, placed, positions)[agree]))
         return WorldFrame(source, 1.0, origin, error, len(local), similarity.matrix().tolist(), int(agree.sum()))

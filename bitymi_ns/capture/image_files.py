@@ -87,7 +87,8 @@ def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[
         with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:
                 fail(wrong_size(path, file.size, stored))
-            size, drafted = file.size, None if wanted is None else file.draft(None, (2 * wanted[0], 2 * wanted[1]))
+            size = file.size
+            drafted = None if wanted is None else file.draft(None, (2 * wanted[0], 2 * wanted[1]))
             picture = in_srgb(eight_bits(file))
             picture = picture.convert("RGBA" if has_transparency(file) else "RGB")
             if wanted is None or picture.size == wanted == size:

@@ -63,7 +63,8 @@ class Pinhole(NamedTuple):
     @property
     def rays(self) -> npt.NDArray[np.float64]:
         """[H, W, 3] rays through the pixels' centres, of z 1, OpenCV axes."""
-        x, y = (np.arange(self.width) + 0.5 - self.cx) / self.fx, (np.arange(self.height) + 0.5 - self.cy) / self.fy
+        x = (np.arange(self.width) + 0.5 - self.cx) / self.fx
+        y = (np.arange(self.height) + 0.5 - self.cy) / self.fy
         return _through(x, y[:, None])
 
 

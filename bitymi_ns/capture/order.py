@@ -32,7 +32,8 @@ class Neighbours:
         if members is None:
             return None
         after = bisect_left(members, (position,))
-        (low, first), (high, last) = members[max(after - 1, 0)], members[min(after, len(members) - 1)]
+        (low, first) = members[max(after - 1, 0)]
+        (high, last) = members[min(after, len(members) - 1)]
         share = next(((n - a) / (b - a) for a, n, b in zip(low, position, high, strict=True) if a != b), 0.0)
         return first, last, share
 

@@ -223,7 +223,8 @@ class _Reader:
             own = self._colored(*read_cloud(path, hint), photographs, path)
         elif model is not None and applied is not None:
             own = self._colored(model_points(model, applied), model.without_colors, photographs, earlier)
-        points, boxed = self._points(own, photographs, source), found.format == "instant-ngp" and "aabb_scale" in meta
+        points = self._points(own, photographs, source)
+        boxed = found.format == "instant-ngp" and "aabb_scale" in meta
         of_file = {"applied": applied, "applied_scale": meta.get("applied_scale", 1.0), "declares_box": boxed}
         return Capture(found.format, source, photographs, points, frame, read.lists, **of_file)
 
@@ -275,7 +276,8 @@ class _Reader:
                 part = self._read_transforms(found.folder / f"transforms_{name}.json")
                 there = [each for each in part.photographs if not need_photos or os.path.isfile(each.file)]
                 if lacking := [each.file for each in part.photographs if each not in there]:
-                    count, left = len(lacking) if there else "all", f"left out: {listed(lacking)}"
+                    count = len(lacking) if there else "all"
+                    left = f"left out: {listed(lacking)}"
                     warn(f"{part.path} lacks {count} of its {len(part.photographs)} photographs, {left}.")
                 parts[name] = range(len(every), len(every) + len(there))
                 every += there
@@ -304,9 +306,11 @@ class _Reader:
         if self.found.format in ("photographs", "video"):
             return list(photographs)
         if self.need_photos:
-            named, masks = (*named, *(each.file for each in photographs)), [each.mask for each in photographs]
+            named = (*named, *(each.file for each in photographs))
+            masks = [each.mask for each in photographs]
             name_unused(self.found, named, masks, self.options.downscale_factor)
-        convention, asked = CONVENTIONS.get(self.found.format, (Reading(), np.eye(4))), self.options.poses_as
+        convention = CONVENTIONS.get(self.found.format, (Reading(), np.eye(4)))
+        asked = self.options.poses_as
         asked = asked if asked != AUTO or self.need_photos else WRITTEN
         meant, self.mirror, self.poses_as = as_meant(photographs, *convention, source, asked)
         return meant

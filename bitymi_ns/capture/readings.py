@@ -189,7 +189,8 @@ def rays_of(pairs: Sequence[Pair], cameras: Sequence[ColmapCamera]) -> list[tupl
     rays = []
     for pair in pairs:
         first, second = lenses[cameras[pair.first]], lenses[cameras[pair.second]]
-        b, step = second.cam_ray_from_img(pair.y), TOLERANCE * max(second.width, second.height) * np.eye(2)
+        b = second.cam_ray_from_img(pair.y)
+        step = TOLERANCE * max(second.width, second.height) * np.eye(2)
         limits = [np.linalg.norm(second.cam_ray_from_img(pair.y + each) - b, axis=1) for each in step]
         rays.append((first.cam_ray_from_img(pair.x), b, np.fmin(*limits)))
     return rays
@@ -228,7 +229,8 @@ def decide(photographs: Sequence[Photograph], poses: Array, written: Reading) ->
     focals = [value for lens in lenses for value in lens.params[lens.focal_length_idxs()]]
     usable = all(np.isfinite(lens.params).all() for lens in lenses) and min(focals, default=1.0) > 0.0
     pairs = match_pairs(photographs) if usable else []
-    own, total = explained(pairs, rays_of(pairs, cameras)), sum(len(pair.x) for pair in pairs)
+    own = explained(pairs, rays_of(pairs, cameras))
+    total = sum(len(pair.x) for pair in pairs)
     if own.sum() < ENOUGH:
         return Decision(written)
     counts: dict[Reading, npt.NDArray[np.int64]] = {}
@@ -258,7 +260,8 @@ def as_meant(
     return them, the reflection [4, 4] of their world, and the reading's name. `frame`: [4, 4] from the world of the
     files to that of the photographs. Raises CaptureError: the format has no such reading."""
     named = {WRITTEN: written} | {each.name: each for each in readings(written)}
-    poses, decision = np.linalg.inv(frame) @ np.stack([each.pose for each in photographs]), Decision(named.get(asked))
+    poses = np.linalg.inv(frame) @ np.stack([each.pose for each in photographs])
+    decision = Decision(named.get(asked))
     if asked == AUTO:
         decision = decide(photographs, poses, written)
     elif decision.reading is None:

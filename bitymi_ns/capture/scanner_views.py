@@ -42,7 +42,8 @@ def scanner_photographs(found: Found) -> list[Photograph]:
         "polycam": _polycam, "record3d": _record3d, "pose-files": _pose_files,
         "3d-scanner": _scanner_app, "stray-scanner": _stray_scanner,
     }  # fmt: skip
-    rows, what = readers[found.format](found.path), f"{found.path}, read as {found.format},"
+    rows = readers[found.format](found.path)
+    what = f"{found.path}, read as {found.format},"
     for row in rows:
         sides = row.size or ()
         if not np.isfinite([*row.pose.ravel(), *row.pinhole]).all() or not all(1 <= side <= MAX_SIDE for side in sides):

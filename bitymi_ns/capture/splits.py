@@ -118,7 +118,9 @@ def by_lists(names: Sequence[Path], lists: NameLists) -> Split:
     def indices(split: str) -> set[int]:  # downscaled photographs are in other folders
         return set(find_named(names, lists.names.get(split, []), lists.source, any_folder=True))
 
-    every, train, held_out = set(range(len(names))), indices("train"), indices("val") | indices("test")
+    every = set(range(len(names)))
+    train = indices("train")
+    held_out = indices("val") | indices("test")
     held_out = held_out if lists.names.keys() - {"train"} else every - train
     train = train if "train" in lists.names else every - held_out
     return Split(sorted(train), sorted(held_out), f"by {lists.source}")
@@ -144,10 +146,12 @@ def read_split_lists(folder: Path, model: Path, files: Sequence[Path]) -> NameLi
     """Read the lists of nerfstudio's COLMAP parser (`*_list.txt`), else 3DGS's `test.txt` in the model's folder, which
     may name more than the photographs' `files`."""
     stated = [(row.what, folder / name) for row in LISTS for name in row.names.split()]
-    lists, test = {split: _names_in(path, path) for split, path in stated if path.is_file()}, model / "test.txt"
+    lists = {split: _names_in(path, path) for split, path in stated if path.is_file()}
+    test = model / "test.txt"
     if lists or not test.is_file():
         return NameLists(lists)
-    there, named = {part for file in files for part in (file.name, file.stem)}, _names_in(test, test)
+    there = {part for file in files for part in (file.name, file.stem)}
+    named = _names_in(test, test)
     known = [name for name in named if {Path(name).name, Path(name).stem} & there]
     if len(known) < len(named):
         warn(f"{test}: {len(named) - len(known)} of {len(named)} names are of no photograph of the capture.")

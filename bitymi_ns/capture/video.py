@@ -260,7 +260,11 @@ def tone_mapped(frame: av.VideoFrame) -> Image.Image:
 
 def pq_to_nits(signal: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     """Convert a PQ signal in [0, 1] to display light in cd/m^2 (ITU-R BT.2100)."""
-    m1, m2, c1, c2, c3 = 2610 / 16384, 2523 / 4096 * 128, 3424 / 4096, 2413 / 4096 * 32, 2392 / 4096 * 32
+    m1 = 2610 / 16384
+    m2 = 2523 / 4096 * 128
+    c1 = 3424 / 4096
+    c2 = 2413 / 4096 * 32
+    c3 = 2392 / 4096 * 32
     power = np.maximum(signal, 0.0) ** (1.0 / m2)
     return 10_000.0 * (np.maximum(power - c1, 0.0) / (c2 - c3 * power)) ** (1.0 / m1)
 

@@ -105,7 +105,8 @@ def texel_alpha(scene: BakedScene) -> TexelAlpha | None:
     if alphas is not None:
         layers, height, width = alphas.shape
         packing = Packing(scene.tiles.cpu().numpy(), width, height, layers, 1.0)
-        sizes, values = scene.tiles[:, 3:].clamp(min=1), listed_texels(alphas[..., None], packing, means[:, None])[:, 0]
+        sizes = scene.tiles[:, 3:].clamp(min=1)
+        values = listed_texels(alphas[..., None], packing, means[:, None])[:, 0]
     return TexelAlpha(TexelTiles.of_sizes(sizes, extent), values.contiguous().to(device), scene.weight_bound)
 
 

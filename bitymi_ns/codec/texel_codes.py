@@ -112,7 +112,8 @@ class TexelCodes:
         names, alphas = coefficient_columns(blocks_of(self.sizes))
         coefficients = list(self.coefficients)
         if self.alpha is not None:
-            names, coefficients = names + alphas, coefficients + list(self.alpha.coefficients)
+            names = names + alphas
+            coefficients = coefficients + list(self.alpha.coefficients)
         named = zip(names, (values.numpy() for values in coefficients), strict=True)
         return {"grade": self.grades.numpy()[:, None], **dict(named)}
 

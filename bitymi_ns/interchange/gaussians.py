@@ -75,7 +75,8 @@ def gaussians_of(scene: BakedScene, coefficients: Tensor) -> Gaussians:
     f = min(0.99, o k m), and their opacity is multiplied by (f-weighted mean of f) / ((o k)-weighted mean of o k).
     """
     surfels = scene.surfels
-    means, quats = surfels["means"].float(), torch.nn.functional.normalize(surfels["quats"].float(), dim=1)
+    means = surfels["means"].float()
+    quats = torch.nn.functional.normalize(surfels["quats"].float(), dim=1)
     variance = SUPPORT**2 / (2.0 * (kernel_parameters(surfels)[1].double() + 2.0))
     tangent = surfels["log_scales"].double() + 0.5 * variance.log()[:, None]
     flat = tangent.new_full((len(tangent), 1), FLAT_LOG_SCALE)

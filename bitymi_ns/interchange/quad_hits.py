@@ -40,7 +40,9 @@ def nearest_hits(quads: Quads, camera: Camera, near: float) -> QuadHits:
     level = (corner * normal).sum(1)
     count = camera.width * camera.height
     depth = torch.full((count,), math.inf, dtype=torch.float64)
-    quad, uv, color = torch.full((count,), -1), depth.new_zeros(count, 2), torch.zeros(count, 3)
+    quad = torch.full((count,), -1)
+    uv = depth.new_zeros(count, 2)
+    color = torch.zeros(count, 3)
     for part in _parts(size.prod(1)):
         own = part.repeat_interleave(size[part].prod(1))
         first = size[part].prod(1).cumsum(0) - size[part].prod(1)
@@ -60,7 +62,9 @@ def nearest_hits(quads: Quads, camera: Camera, near: float) -> QuadHits:
         depth.scatter_reduce_(0, pixel[met], z[met], "amin")
         first = z[met] <= depth[pixel[met]]
         met = met[first]
-        quad[pixel[met]], uv[pixel[met]], color[pixel[met]] = rows[own[met]], at[first], texel[first, :3]
+        quad[pixel[met]] = rows[own[met]]
+        uv[pixel[met]] = at[first]
+        color[pixel[met]] = texel[first, :3]
     pixel = torch.nonzero(quad >= 0).squeeze(1)
     return QuadHits(pixel, quad[pixel], uv[pixel], color[pixel])
 

@@ -30,7 +30,8 @@ def recolored(
     renders a view, [H, W, 3]."""
     pages, height, width, _ = quads.pages.shape
     shift, shown = torch.zeros(len(quads), 3), torch.zeros(len(quads), 1)
-    texels, count = torch.zeros(pages * height * width, 3), torch.zeros(pages * height * width, 1)
+    texels = torch.zeros(pages * height * width, 3)
+    count = torch.zeros(pages * height * width, 1)
     flat = quads.pages.reshape(-1, 4).clone()
     for done, camera in enumerate(cameras, start=1):
         wanted = picture(camera).clamp(0.0, 1.0).reshape(-1, 3)

@@ -211,7 +211,8 @@ def _postprocess(
 
 
 def _from_open3d(mesh: open3d.geometry.TriangleMesh, to: Similarity | None) -> Triangles:
-    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles).astype(np.int64)
+    vertices = np.asarray(mesh.vertices)
+    faces = np.asarray(mesh.triangles).astype(np.int64)
     if to is not None:
         vertices = to.points(torch.from_numpy(vertices)).numpy()
         if float(torch.linalg.det(to.turn)) < 0:  # a reflection turns triangles inside out

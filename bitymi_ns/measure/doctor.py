@@ -82,7 +82,8 @@ def _train(device: str) -> float:
     numbers = torch.Generator().manual_seed(0)
     camera = Camera(torch.eye(4), torch.tensor([[40.0, 0.0, 24.0], [0.0, 40.0, 18.0], [0.0, 0.0, 1.0]]), 48, 36)
     points = torch.rand(64, 3, generator=numbers) + torch.tensor([-0.5, -0.5, 1.0])
-    views, preset = [View(camera, torch.rand(36, 48, 3, generator=numbers)).to(device)], load_preset("bitymi")
+    views = [View(camera, torch.rand(36, 48, 3, generator=numbers)).to(device)]
+    preset = load_preset("bitymi")
     start = time.perf_counter()
     scene = scene_for_views(views, points, points.clamp(0, 1), preset.scene, preset.train, 1).to(device)
     Trainer(scene, views, preset.train, 1).advance()

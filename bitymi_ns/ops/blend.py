@@ -38,7 +38,10 @@ def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, 
 class _BlendedImage(torch.autograd.Function):
     @staticmethod
     def forward(ctx, weight, depth, uv, geom, base, texels, residual, fragments, tiles, bound, maps, descent):
-        g, b, t, arrays = dense(geom, geom), dense(base, geom), dense(texels, geom), fragments.arrays
+        g = dense(geom, geom)
+        b = dense(base, geom)
+        t = dense(texels, geom)
+        arrays = fragments.arrays
         r = None if residual is None else dense(residual, geom)
         image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
         ctx.arguments = {"maps": maps, **fragments.view, **tiles.arrays, "bound": bound}

@@ -34,7 +34,8 @@ class TooManyFragments(RuntimeError):
     beside 5 numbers of geom's dtype."""
 
     def __init__(self, geom: Tensor, projection: Projection, count: int, most: int, ids: bool) -> None:
-        size, pixels = 5 * geom.element_size() + 8 * ids, projection.camera.width * projection.camera.height
+        size = 5 * geom.element_size() + 8 * ids
+        pixels = projection.camera.width * projection.camera.height
         super().__init__(
             f"the view has {count:,} fragments, {count / pixels:.0f} per pixel; their list needs "
             f"{count * size / 2**30:.2f} GiB, and there is room for {most:,}: render a smaller image or use fewer "

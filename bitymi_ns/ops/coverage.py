@@ -57,7 +57,9 @@ def add_texel_coverage(
         of_tiles = {f"covered_{name}": value for name, value in tiles.arrays.items()}
         _sum_fragments("texel_coverage", projection, bound, covered=covered, **of_tiles, **flat)
         return
-    top, total, squares = 0, covered.new_zeros(len(covered), 3), covered.new_zeros(len(covered))
+    top = 0
+    total = covered.new_zeros(len(covered), 3)
+    squares = covered.new_zeros(len(covered))
     for fragments in fitting_lists(projection):
         pixels = fragments.width * fragments.height
         _add_of_list(fragments, tiles, None if counts is None else counts[top : top + pixels], bound, total, squares)
@@ -77,7 +79,9 @@ def _add_of_list(
 ) -> None:
     """Add the coverage by listed fragments to total [T, 3] (equal columns) and squares [T]: a backward pass of blending
     with image gradient 1 and texel rate -1."""
-    like, surfels, pixels = tiles.extent, fragments.surfels, fragments.width * fragments.height
+    like = tiles.extent
+    surfels = fragments.surfels
+    pixels = fragments.width * fragments.height
     counts = like.new_ones(pixels) if mask is None else mask.to(like.dtype)
     base, geom = like.new_zeros(surfels, 3), like.new_zeros(surfels, GEOM)
     kernel("blend_backward", total)(

@@ -86,10 +86,12 @@ def select(
         keep: [F] bool.
         width, height: of the image, pixels.
     """
-    masks, counts = torch.empty_like(layout.arrays["masks"]), torch.empty_like(layout.arrays["offsets"][1:])
+    masks = torch.empty_like(layout.arrays["masks"])
+    counts = torch.empty_like(layout.arrays["offsets"][1:])
     flags = keep.contiguous().view(torch.uint8)
     function("select_fragments", keep.device)(layout=layout.handle, keep=flags, masks=masks, counts=counts)
-    offsets, rows = torch.nn.functional.pad(counts.cumsum(0), (1, 0)), keep.nonzero().squeeze(1)
+    offsets = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+    rows = keep.nonzero().squeeze(1)
     ids = {name: value[rows] for name, value in layout.ids().items()}
     listed = {name: value[..., rows].contiguous() for name, value in numbers.items()}
     return layout_of(layout.arrays | {"masks": masks, "offsets": offsets}, width, height, ids), listed

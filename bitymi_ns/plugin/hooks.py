@@ -133,7 +133,9 @@ def answer_checkpoint_dir(config: Any, usual: Callable[[], Path]) -> Path:
     ns-viewer, ns-export. Without: no moved run or bundle opens, and commands that cannot work end in tracebacks.
     Superfluous once eval_setup passes on the path that it loads.
     """
-    model, evaluated, running = config.pipeline.model, _folder_being_evaluated(), _running_command()
+    model = config.pipeline.model
+    evaluated = _folder_being_evaluated()
+    running = _running_command()
     command = None if running is None else running[0]
     if evaluated is not None:
         exit_messages.install()

@@ -156,7 +156,9 @@ class TexelField(nn.Module):
         old = self.tiles.rows_of(rows)
         self.texels = nn.Parameter(self.texels.detach()[old])
         self.alpha = None if self.alpha is None else nn.Parameter(self.alpha.detach()[old])
-        self.share, self.size, self.extent = self.share[old], self.size[rows], self.extent[rows]
+        self.share = self.share[old]
+        self.size = self.size[rows]
+        self.extent = self.extent[rows]
 
     def texture(
         self, bound: float, learns: bool, descent: TexelDescent | None = None, read: Tensor | None = None

@@ -76,7 +76,8 @@ def visibility(
     for done, camera in enumerate(cameras, start=1):
         projection = project(*geometry, camera=camera.to(means.device), near=near, alpha=alpha)
         shown = surfel_coverage(projection, weight_bound)
-        largest, pixels = torch.maximum(largest, shown[:, 0]), torch.maximum(pixels, shown[:, 1])
+        largest = torch.maximum(largest, shown[:, 0])
+        pixels = torch.maximum(pixels, shown[:, 1])
         squares[done - 1] = shown[:, 2]
         progress("looking through the training views", done, len(cameras))
     return Visibility(largest, pixels, squares)

@@ -92,7 +92,8 @@ class _Grid(NamedTuple):
     def of(cls, camera: Camera, x: Tensor, y: Tensor, z: Tensor, count: float) -> _Grid:
         """Bin the points of a view, [V] pixel coordinates and camera z, into nearly square cells. `count`: number of
         points that decides their size."""
-        longer, shorter = max(camera.width, camera.height), min(camera.width, camera.height)
+        longer = max(camera.width, camera.height)
+        shorter = min(camera.width, camera.height)
         side = longer / min(CELLS, max(1.0, math.sqrt(count / POINTS_PER_CELL * longer / shorter)))
         rows, columns = math.ceil(camera.height / side), math.ceil(camera.width / side)
         grid = cls(torch.full((rows, columns), math.inf), camera.width / columns, camera.height / rows)

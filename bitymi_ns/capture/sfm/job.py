@@ -12,8 +12,8 @@ from typing import Protocol
 
 from pydantic import TypeAdapter
 
-from bitymi_ns.capture.cache import emptied
-from bitymi_ns.capture.types import ColmapCamera
+from ..cache import emptied
+from ..types import ColmapCamera
 
 DATABASE = "database.db"
 PAIRS = "pairs.txt"

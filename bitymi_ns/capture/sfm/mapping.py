@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.types import CONTRADICTED
+from .. import pycolmap
+from ..types import CONTRADICTED
 from . import matching, model_checks
 from .job import DATABASE, MAX_ERROR, Job, NoPoses, StageProgress
 from .model_checks import contradicted, drop_unlinked

@@ -7,9 +7,9 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 
-from bitymi_ns.capture import pycolmap
-from bitymi_ns.capture.types import SPHERICAL_MODEL
 from bitymi_ns.files import write_file
+from .. import pycolmap
+from ..types import SPHERICAL_MODEL
 from .job import PAIRS, CameraGroup, Job, StageProgress
 
 SMALL = 1000  # pixels; photographs with a shorter longer side are doubled

@@ -10,7 +10,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from bitymi_ns.capture import pycolmap
+from .. import pycolmap
 from .job import MAX_ERROR, CameraGroup, Job, NoPoses
 
 LINK = 15  # points that link two photographs; COLMAP's least inliers of a pair

@@ -12,10 +12,10 @@ from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.files import size_text
 from bitymi_ns.progress import Progress
 from bitymi_ns.trust import no_links, python_command
+from ..types import CaptureError
 from .job import DATABASE, PAIRS, Job
 
 LOG = "colmap.log"

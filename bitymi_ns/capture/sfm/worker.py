@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap  # with its signal handlers, which log the stack of a crash
 
-from bitymi_ns.capture.colmap_model import write_model
 from bitymi_ns.files import complete_folder, write_errors_as
+from ..colmap_model import write_model
 from . import mapping, matching, model_checks
 from .job import DATABASE, MODEL, Job, NoPoses
 

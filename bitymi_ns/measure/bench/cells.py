@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.files import write_errors_as
-from bitymi_ns.measure.machine import commit, machine, versions
 from bitymi_ns.safe_reading import read_bytes
 from bitymi_ns.trust import json_of, no_links
+from ..machine import commit, machine, versions
 from .process import BenchError
 
 FILE = "cells.jsonl"

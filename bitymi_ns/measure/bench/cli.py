@@ -10,11 +10,11 @@ from typing import get_args
 import tyro
 
 from bitymi_ns.files import check_writable, write_errors_as
-from bitymi_ns.measure.markdown import page, publish
-from bitymi_ns.measure.report.read import add_cells
-from bitymi_ns.measure.report.records import Records
-from bitymi_ns.measure.report.tables import NOTES, quality_markdown
 from bitymi_ns.trust import printable
+from ..markdown import page, publish
+from ..report.read import add_cells
+from ..report.records import Records
+from ..report.tables import NOTES, quality_markdown
 from .cells import FILE, Cells
 from .engine import run_chains
 from .matrix import Chain, Format, PlanName, Row, chains, local_scenes, read_plan, standard_scenes
@@ -46,7 +46,8 @@ class BenchRun:
         """List the cells of each run of these options. Raises BenchError: an option is invalid."""
         if self.steps is not None and self.steps < 1:
             raise BenchError(f"--steps must be at least 1, not {self.steps}")
-        rows, bundles = {name: Row(name) for name in self.methods}, {name: ["--format", name] for name in self.formats}
+        rows = {name: Row(name) for name in self.methods}
+        bundles = {name: ["--format", name] for name in self.formats}
         if self.plan:
             rows, bundles = read_plan(self.plan)
         extra = shlex.split(self.extra)
@@ -78,7 +79,8 @@ class BenchRun:
         for failure in failures:
             say(failure)
         cells.refresh()
-        finished, records = [cell for chain in runs for spec in chain if (cell := cells.get(spec.key))], Records()
+        finished = [cell for chain in runs for spec in chain if (cell := cells.get(spec.key))]
+        records = Records()
         add_cells(finished, cells.path, records)
         failed = [f"Failed: {line.splitlines()[0].removesuffix(', whose end is:')}." for line in failures]
         commits = [cell["made"]["commit"] for cell in finished]

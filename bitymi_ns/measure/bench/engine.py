@@ -8,8 +8,8 @@ from typing import Any
 
 from bitymi_ns.files import write_errors_as
 from bitymi_ns.locks import Busy, Lock
-from bitymi_ns.measure.report.read import read_jsonl
 from bitymi_ns.safe_reading import read_json, reading
+from ..report.read import read_jsonl
 from .cells import FILE, Cells, provenance
 from .matrix import Cell, Chain
 from .process import BenchError, CommandFailed, run_measured, say, tool
@@ -35,7 +35,8 @@ def command_of(work: Path, cell: Cell) -> list[str]:
     """Build the command line of a cell."""
     if cell.cell == "train":
         return train_command(work, cell)
-    config, output = ("--load-config", str(work / cell.parent.output / "config.yml")), str(work / cell.output)
+    config = ("--load-config", str(work / cell.parent.output / "config.yml"))
+    output = str(work / cell.output)
     if cell.cell == "export":
         return [tool("ns-export"), "bitymi-atlas", *config, "--output-dir", output, *cell.export]
     pictures = ("--render-output-path", output.removesuffix(".json"))

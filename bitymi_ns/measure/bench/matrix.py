@@ -167,7 +167,8 @@ def standard_scenes(name: str, root: Path, only: Sequence[str] = ()) -> list[Sce
     if unknown:
         raise BenchError(f"{name} has no scene {', '.join(unknown)}; it has {', '.join(suite['scenes'])}")
     for scene in only or suite["scenes"]:
-        folder, factor = Path(os.path.expanduser(root)).resolve() / scene, suite["scenes"][scene]
+        folder = Path(os.path.expanduser(root)).resolve() / scene
+        factor = suite["scenes"][scene]
         needed = [part.format(images="images" if factor == 1 else f"images_{factor}") for part in suite["needed"]]
         missing = [part for part in needed if not (folder / part).exists()]
         if missing:

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from bitymi_ns.files import check_writable, write_errors_as, write_file
-from bitymi_ns.measure.markdown import rendered
 from bitymi_ns.safe_reading import open_regular
+from ..markdown import rendered
 from .pictures import ERROR_SCALE, compare_views
 from .plots import draw_plots
 from .read import collect

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from bitymi_ns.measure.figure import COLORS, INK, log_when_wide, panels, png, styled
+from ..figure import COLORS, INK, log_when_wide, panels, png, styled
 from .records import Curve, Evaluation
 
 MARKERS = "s^DvPX*p<>hd8H"  # of bundles, one per format

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from bitymi_ns.measure.bench.cells import FILE as CELLS
-from bitymi_ns.measure.bench.cells import NOT_OF_A_RUN, Cells, identity
 from bitymi_ns.safe_reading import read_json, read_text, reading
 from bitymi_ns.trust import finite_numbers, json_of
+from ..bench.cells import FILE as CELLS
+from ..bench.cells import NOT_OF_A_RUN, Cells, identity
 from .pictures import SIDE_BY_SIDE
 from .records import Evaluation, Records, ReportError, curve_from, evaluation_from, grouped, link
 
@@ -49,7 +49,9 @@ def add_cells(cells: Iterable[dict[str, Any]], path: Path, records: Records) -> 
         seeds = Counter(identity(key, *NOT_OF_A_RUN, "seed") for key in keys)
         namesakes = Counter((key["scene"], key["row"], key.get("seed")) for key in keys)
         for of_run, key in zip(runs.values(), keys, strict=True):
-            name, seed, series = str(key["row"]), key.get("seed"), identity(key, *NOT_OF_A_RUN, "seed")
+            name = str(key["row"])
+            seed = key.get("seed")
+            series = identity(key, *NOT_OF_A_RUN, "seed")
             if namesakes[key["scene"], key["row"], seed] > 1:  # runs that differ in their length
                 name += f", {key['steps']:,} steps" if key["steps"] else ", own length"
             suffix = f", seed {seed}" if seeds[series] > 1 and seed is not None else ""

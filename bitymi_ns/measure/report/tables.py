@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal, NamedTuple
 
-from bitymi_ns.measure import markdown
-from bitymi_ns.measure.markdown import escaped
+from .. import markdown
+from ..markdown import escaped
 from .records import Evaluation, grouped, means
 
 MISSING = "–"

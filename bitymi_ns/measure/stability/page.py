@@ -10,9 +10,9 @@ import torch
 from matplotlib.ticker import LogLocator
 
 from bitymi_ns.files import check_writable, write_file
-from bitymi_ns.measure import markdown
-from bitymi_ns.measure.figure import panels, png, styled
-from bitymi_ns.measure.markdown import rendered
+from .. import markdown
+from ..figure import panels, png, styled
+from ..markdown import rendered
 from .errors import PROBES, Backend, Errors, measure
 from .scenes import PLAIN, RIM, SWEEPS, WAYS, SceneCase, Way, extreme_scenes
 

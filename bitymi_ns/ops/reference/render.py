@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from bitymi_ns.ops.project import Pinhole
+from ..project import Pinhole
 from .project import project
 from .trace import SUPPORT, Trace, trace
 

@@ -45,7 +45,9 @@ def sh_basis(degree: int, dirs: Tensor) -> Tensor:
             a / 2 * (x * x - y * y),
         ]
     if degree >= 3:
-        a, b, c = math.sqrt(35 / (32 * pi)), math.sqrt(105 / (4 * pi)), math.sqrt(21 / (32 * pi))
+        a = math.sqrt(35 / (32 * pi))
+        b = math.sqrt(105 / (4 * pi))
+        c = math.sqrt(21 / (32 * pi))
         basis += [
             -a * y * (3 * x * x - y * y),
             b * x * y * z,

@@ -111,7 +111,8 @@ def _view_colors(kind: str, p: dict[str, Tensor], n: int) -> tuple[str, Tensor, 
     values = VIEW_COLORS[kind].of(p)
     whole = VIEW_COLORS[kind].sites is not None
     if whole:
-        base, terms = torch.zeros(n, 3), torch.cat([values[0], values[1][..., None], values[2]], dim=2)
+        base = torch.zeros(n, 3)
+        terms = torch.cat([values[0], values[1][..., None], values[2]], dim=2)
     else:
         base, terms = values
     count = torch.full((n,), terms.shape[1])

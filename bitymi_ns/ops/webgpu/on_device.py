@@ -62,7 +62,9 @@ class SceneOnDevice:
         self.count = len(packed.surfels)
         check_room(array_bytes=max(packed.surfels.nbytes, packed.terms.nbytes), groups=-(-self.count // 64))
         self._near, self._bound = scene.near, scene.weight_bound
-        self._offset, self._scale, self._alpha_scale = scene.offset, scene.scale, scene.alpha_scale
+        self._offset = scene.offset
+        self._scale = scene.scale
+        self._alpha_scale = scene.alpha_scale
         flags = library().BufferUsage
         storage, n = flags.STORAGE, max(1, self.count)
         self._surfels = self._upload(packed.surfels, storage)
@@ -210,7 +212,9 @@ class SceneOnDevice:
 
     def _target_of(self, width: int, height: int) -> _Target:
         if self._target is None or self._target.size != (width, height):
-            flags, buffers, p = library().TextureUsage, library().BufferUsage, self._programs
+            flags = library().TextureUsage
+            buffers = library().BufferUsage
+            p = self._programs
             size, texel = (width, height, 1), 16 if p.format == "rgba32float" else 8
             check_room(size=(width, height))
             sums = self._device.create_texture(

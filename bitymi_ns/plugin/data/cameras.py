@@ -7,8 +7,8 @@ import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
-from bitymi_ns.plugin.console import fail, listed, warn
 from bitymi_ns.scene.camera import Camera
+from ..console import fail, listed, warn
 
 MAX_OFF_AXIS = 80  # largest angle from the optical axis to the picture's middle, degrees
 USUAL_VIEW = (0.5, 150.0)  # of plausible focal lengths, degrees

@@ -22,8 +22,8 @@ from bitymi_ns.capture.recognise import Format
 from bitymi_ns.capture.transforms import HOW_TO_GET_ONE
 from bitymi_ns.capture.types import CaptureError
 from bitymi_ns.exit_messages import line_of
-from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.safe_reading import read_json, why
+from ..console import as_input_error, fail
 from .dataparser import BitymiDataParserConfig
 from .views import MOVED
 

@@ -21,13 +21,13 @@ from torch import Tensor
 from bitymi_ns.capture import image_files, splits
 from bitymi_ns.capture.find_files import check_photographs_exist
 from bitymi_ns.capture.pose_checks import check_outliers, check_point_unit, warn_of_mirrored
-from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.exposure import restored
 from bitymi_ns.train.poses import carried, cross_matrix
 from bitymi_ns.train.processes import Processes
 from bitymi_ns.train.views import MemoryBudget, OnDemand, View, training_order
+from ..console import as_input_error, fail, listed, warn
 from .cameras import check_cameras, to_camera, to_cameras
 from .capture_checks import check_capture, declares_box, reporting_input_errors
 from .dataparser import BitymiDataParserConfig, BundleCamerasConfig
@@ -150,7 +150,8 @@ class BitymiDataManager(FullImageDatamanager[BitymiDataset]):
         if len(points) and not len(outputs.metadata["points3D_rgb"]):
             warn("The points of the capture have no colors: they start grey.")
         cameras = outputs.cameras
-        centers, widths = cameras.camera_to_worlds[:, :, 3].double(), (cameras.width / cameras.fx).flatten().double()
+        centers = cameras.camera_to_worlds[:, :, 3].double()
+        widths = (cameras.width / cameras.fx).flatten().double()
         check_point_unit(points.double().numpy(), centers.numpy(), widths.numpy())
 
     def create_train_dataset(self) -> BitymiDataset:

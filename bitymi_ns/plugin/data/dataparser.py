@@ -20,8 +20,8 @@ from bitymi_ns.capture.read import Capture, CaptureOptions, read_capture
 from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.recognise import Found
 from bitymi_ns.capture.types import OPENCV_AXES
-from bitymi_ns.plugin.console import as_input_error, fail
 from bitymi_ns.trust import inside
+from ..console import as_input_error, fail
 from .depth import DepthKind
 from .facts import KEY, CaptureFacts
 from .views import Views, make_views, pinhole_cameras

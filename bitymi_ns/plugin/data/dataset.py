@@ -20,8 +20,8 @@ from bitymi_ns.bundle.sizes import memory_limit
 from bitymi_ns.capture.image_files import ImageSummary, in_threads, pixels_of, read_image, summarize, wrong_size
 from bitymi_ns.capture.masks import checked_mask
 from bitymi_ns.capture.pose_checks import rotations
-from bitymi_ns.plugin.console import as_input_error, fail, listed, warn
 from bitymi_ns.train.views import MemoryBudget, OnDemand, over_background, resample_nearest
+from ..console import as_input_error, fail, listed, warn
 from .facts import CaptureFacts
 from .views import MOVED, select_views
 

@@ -16,8 +16,8 @@ from bitymi_ns.capture.depth_normal_maps import Values, read_depth, read_normal
 from bitymi_ns.capture.image_files import in_threads, read_image
 from bitymi_ns.capture.lens import Lens
 from bitymi_ns.capture.points import GREY
-from bitymi_ns.plugin.console import say, warn
 from bitymi_ns.ranges import spread
+from ..console import say, warn
 from .facts import KEY, CaptureFacts, DepthFit, FittedMaps
 
 DepthKind = Literal["auto", "metric", "relative", "off"]
@@ -112,7 +112,8 @@ def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, np
     local = (xyz - view.center) @ view.rotation
     front = local[:, 2] > 0.0
     z = np.where(front, local[:, 2], 1.0)
-    x, y = np.floor(to.fx * local[:, 0] / z + to.cx), np.floor(to.fy * local[:, 1] / z + to.cy)
+    x = np.floor(to.fx * local[:, 0] / z + to.cx)
+    y = np.floor(to.fy * local[:, 1] / z + to.cy)
     inside = front & (x >= 0) & (x < to.width) & (y >= 0) & (y < to.height)
     return np.where(inside, y * to.width + x, 0).astype(np.intp), z, inside
 
@@ -120,7 +121,8 @@ def _project(xyz: Floats, view: _Seen) -> tuple[npt.NDArray[np.intp], Floats, np
 def _unproject(pixels: npt.NDArray[np.intp], view: _Seen) -> Floats:
     """Compute world positions [N, 3] of pixels of a fitted view."""
     to, z = view.lens.pinhole, view.values.ravel()[pixels]
-    x, y = (pixels % to.width + 0.5 - to.cx) / to.fx, (pixels // to.width + 0.5 - to.cy) / to.fy
+    x = (pixels % to.width + 0.5 - to.cx) / to.fx
+    y = (pixels // to.width + 0.5 - to.cy) / to.fy
     return np.stack([x * z, y * z, z], -1) @ view.rotation.T + view.center
 
 

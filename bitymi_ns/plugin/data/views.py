@@ -16,7 +16,7 @@ from bitymi_ns.capture.lens import Lens, Pinhole, colmap_distortion, make_lenses
 from bitymi_ns.capture.pose_checks import check_spread, far_from_origin
 from bitymi_ns.capture.read import Capture
 from bitymi_ns.capture.types import OPENCV_AXES, SPHERICAL_MODEL, ColmapCamera, FrameOptions, MapFiles, Photograph, Pose
-from bitymi_ns.plugin.console import fail, listed, say
+from ..console import fail, listed, say
 from .facts import KEY, CaptureFacts
 
 DATA = "BITYMI_DATA"
@@ -38,7 +38,10 @@ def make_views(
     """Build a capture's views by part (train, val, test). `need_photos`: open downscaled copies for their size; else
     they may be missing. `alpha_color`: [3] behind transparent photographs. Raises CaptureError: a camera or a
     photograph cannot be used."""
-    photographs, frame, points, source = capture.photographs, capture.frame, capture.points, capture.source
+    photographs = capture.photographs
+    frame = capture.frame
+    points = capture.points
+    source = capture.source
     if len(photographs) == 1:
         fail(f"{source} has one image only: add photographs.")
     parts = make_lenses(photographs, capture.downscale, need_photos)

@@ -22,13 +22,13 @@ from bitymi_ns.interchange.extras import (
     summary_line,
     write_extras,
 )
-from bitymi_ns.plugin.console import INTERRUPTED, fail, say, warn
-from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.run.memory import state_export
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.ranges import Count, check_ranges
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.train.exposure import corrected
+from ..console import INTERRUPTED, fail, say, warn
+from ..data.cameras import to_cameras
+from ..run.memory import state_export
 from .summary import print_summary
 from .target import bundle_config, bundle_version, check_room
 from .trained import camera_files, compare, load_trained, preview, world_of
@@ -141,12 +141,15 @@ class ExportAtlas(BakeOptions):
         if not self.exact:
             steps = (self.polish_steps, self.finetune_steps, memory)
             refine = RefineOptions.for_scene(model.scene, len(views), *steps, model.train_config, compacting)
-        polish, tune, has_learned = refine.polish, refine.tune, isinstance(model.scene.field, TexelField)
+        polish = refine.polish
+        tune = refine.tune
+        has_learned = isinstance(model.scene.field, TexelField)
         for name, options_of in (("polish", polish), ("finetune", None if polish or has_learned else tune)):
             if options_of is not None and options_of.steps < FEWEST_PASSES * len(views):
                 each = f"{len(views):,} training photographs, {options_of.steps / len(views):.1f} for each"
                 say(f"The {name} has {options_of.steps:,} steps for {each}: more may gain (--{name}-steps).")
-        kept, learning_surfels = tune.cache_bytes if tune else 0, len(model.scene) if polish else 0
+        kept = tune.cache_bytes if tune else 0
+        learning_surfels = len(model.scene) if polish else 0
         state_export(model.scene, views, kept, learning_surfels, compact)
         try:
             with rich_progress() as progress:

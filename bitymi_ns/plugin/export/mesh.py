@@ -22,11 +22,11 @@ from bitymi_ns.interchange.frame import to_capture, up_of
 from bitymi_ns.interchange.surface import NoSurface, SurfaceOptions, extract_surface
 from bitymi_ns.interchange.surface_files import MeshFormat, mesh_bytes
 from bitymi_ns.ops import TexelAlpha
-from bitymi_ns.plugin.console import InputError, fail, say, warn
-from bitymi_ns.plugin.data.cameras import to_cameras
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.scene.camera import Camera
+from ..console import InputError, fail, say, warn
+from ..data.cameras import to_cameras
 from .trained import load_trained, world_of
 
 NAME = "mesh"

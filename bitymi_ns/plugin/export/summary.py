@@ -15,8 +15,8 @@ from bitymi_ns.bundle.statistics import FineTuning
 from bitymi_ns.bundle.verify import steps_text
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.ops import VIEW_COLORS
-from bitymi_ns.plugin.console import say
 from bitymi_ns.trust import printable
+from ..console import say
 
 Add = Callable[[str, str], None]  # adds a row: name and text
 _MUCH_SMALLER = 0.9

@@ -12,9 +12,9 @@ from bitymi_ns.bundle.bake_options import BakeOptions
 from bitymi_ns.bundle.manifest import MANIFEST, Manifest
 from bitymi_ns.codec.quantise import BYTES_PER_TEXEL
 from bitymi_ns.files import free_bytes, size_text
-from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.run.bundle_model import BakedModelConfig
-from bitymi_ns.plugin.run.config import method_config
+from ..console import fail
+from ..run.bundle_model import BakedModelConfig
+from ..run.config import method_config
 
 SURFEL_BYTES = 60 * 4  # of parameters; checkpoints have them and Adam's two moments
 TYPICAL_SIDE = 32  # side of a tile in texels; most are far smaller

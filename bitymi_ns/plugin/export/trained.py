@@ -21,13 +21,13 @@ from bitymi_ns.bundle.statistics import HeldOut
 from bitymi_ns.bundle.world import World
 from bitymi_ns.capture.frame import UP, read_frame
 from bitymi_ns.exit_messages import line_of
-from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.run.model import BitymiModel
 from bitymi_ns.scene.baked import BakedScene, as_bytes
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.train.losses import fitted_psnr, psnr
 from bitymi_ns.trust import told_apart
+from ..console import fail
+from ..data.cameras import to_cameras
+from ..run.model import BitymiModel
 
 _PSNR_SLACK = 0.1  # dB
 MOST_PIXELS = 1600  # longer side of a photograph in a bundle
@@ -63,7 +63,8 @@ def world_of(datamanager: Any) -> World:
     outputs = datamanager.train_dataparser_outputs
     report = datamanager.train_dataset.facts.poses_report
     frame = None if report is None else read_frame(report)
-    transform, scale = np.asarray(outputs.dataparser_transform)[:3], float(outputs.dataparser_scale)
+    transform = np.asarray(outputs.dataparser_transform)[:3]
+    scale = float(outputs.dataparser_scale)
     return World(transform, scale) if frame is None else World(transform, scale, UP, frame.up, frame.metres_per_unit)
 
 
@@ -146,7 +147,8 @@ def check_run(bundle: Bundle, run: Path, views: int) -> list[Check]:
     checks = [check_view_color(bundle, model.scene.surfels, train)]
     if len(datamanager.eval_dataset):
         rows = held_out_psnr(model, datamanager, bundle.scene, views)
-        worst, photos = min(row[0] for row in rows), sum(row[2] - row[1] for row in rows) / len(rows)
+        worst = min(row[0] for row in rows)
+        photos = sum(row[2] - row[1] for row in rows) / len(rows)
         stated = bundle.info.statistics.held_out and bundle.info.statistics.held_out.psnr_baked_against_neural_worst
         detail = f"at least {worst:.2f} dB in {len(rows)} views"
         detail += "" if stated is None else f" (stated {stated:.2f})"

@@ -17,13 +17,13 @@ from bitymi_ns.bundle import REMEDY, BundleError, read_bundle
 from bitymi_ns.bundle.notes import NotesError
 from bitymi_ns.bundle.read import download_bytes, read_cameras
 from bitymi_ns.ops import webgpu
-from bitymi_ns.plugin.console import fail
-from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.data.views import DATA
 from bitymi_ns.scene.baked import FAST
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.crop import Box
 from bitymi_ns.scene.scene_renderer import SceneRenderer
+from ..console import fail
+from ..data.cameras import to_cameras
+from ..data.views import DATA
 from .device import kernel_device
 from .surfel_model import SurfelModel, SurfelModelConfig, box_of
 
@@ -50,7 +50,8 @@ class BakedModel(SurfelModel):
 
     def populate_modules(self) -> None:
         super().populate_modules()
-        folder, renderer = Path(self.config.bundle), os.environ.get(RENDERER) or self.config.renderer
+        folder = Path(self.config.bundle)
+        renderer = os.environ.get(RENDERER) or self.config.renderer
         if renderer not in ("kernels", "fast", "webgpu"):
             fail(f"{RENDERER} must be kernels, fast or webgpu, not {renderer!r}")
         crop = os.environ.get(CROP) or str(self.config.crop)

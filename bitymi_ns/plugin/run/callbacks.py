@@ -20,9 +20,6 @@ from bitymi_ns import exit_messages
 from bitymi_ns.capture.image_files import exposure_stops
 from bitymi_ns.files import reason, write_errors_as, write_file
 from bitymi_ns.ops.backend import give_back_memory
-from bitymi_ns.plugin.console import InputError, duration, fail, listed, say, warn
-from bitymi_ns.plugin.data.cameras import to_camera
-from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.field import TexelField
 from bitymi_ns.scene.visibility import views_without_surfels
@@ -34,6 +31,9 @@ from bitymi_ns.train.init import scene_extent
 from bitymi_ns.train.step import Training
 from bitymi_ns.train.views import OnDemand, TrainingData, covered_fraction
 from bitymi_ns.trust import json_of, no_links
+from ..console import InputError, duration, fail, listed, say, warn
+from ..data.cameras import to_camera
+from ..data.dataset import capture_fingerprint, warn_of_other_capture
 from .memory import state_training
 
 SOON = 60  # seconds; shorter runs do not state their end
@@ -47,14 +47,19 @@ class TrainingRun:
         trainer: Any = attributes.trainer  # nerfstudio declares another type
         pipeline: Any = attributes.pipeline
         optimizers: Any = attributes.optimizers
-        self.scene, self.config, self._curve_views = model.scene, model.train_config, model.config.curve_views
+        self.scene = model.scene
+        self.config = model.train_config
+        self._curve_views = model.config.curve_views
         scene, config, curve_points = self.scene, self.config, model.config.curve_points
         self.datamanager: Any = pipeline.datamanager
         self.total: int = trainer.config.max_num_iterations
         self.first_step: int = trainer._start_step
         self._parameters = optimizers.parameters
-        dataset, views, facts = self.datamanager.train_dataset, self.datamanager.train_views, model.facts
-        train, extent = dataset.cameras, scene_extent(facts.camera_centers, scene.surfels["means"])
+        dataset = self.datamanager.train_dataset
+        views = self.datamanager.train_views
+        facts = model.facts
+        train = dataset.cameras
+        extent = scene_extent(facts.camera_centers, scene.surfels["means"])
         cameras = OnDemand(len(train), lambda i: to_camera(train[i : i + 1], "cpu"))
         counts = (facts.train_pixels, model.first_surfels, covered_fraction(views))
         data = TrainingData(views, cameras, extent, *counts, exposure_stops(facts.files), facts.files)
@@ -88,8 +93,10 @@ class TrainingRun:
         if self.first_step == 0:
             self._check_start()
         learns = scene.config.texture == "texels"
-        texels, to_come = config.texels if learns else None, self.training.texels.views_to_come
-        pixels, schedule = [camera.width * camera.height for camera in cameras], self.training.schedule
+        texels = config.texels if learns else None
+        to_come = self.training.texels.views_to_come
+        pixels = [camera.width * camera.height for camera in cameras]
+        schedule = self.training.schedule
         mean = sum(pixels) / len(pixels)
         surfels = expected_surfels(schedule, model.first_surfels, mean, self.training.strategy.most)
         lists = schedule.config.loss.overdraw_weight > 0.0

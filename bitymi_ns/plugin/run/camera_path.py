@@ -11,9 +11,9 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, ValidationError
 
 from bitymi_ns.files import write_errors_as
-from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.ranges import first_problem
 from bitymi_ns.safe_reading import read_json, reading
+from ..console import InputError, fail, warn
 
 MOST_PIXELS = 16_384  # along a side of a frame
 SLACK = 1e-3  # tolerance of R R^T = I

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 
 from bitymi_ns.files import complete_file, reason
-from bitymi_ns.plugin.console import InputError, fail, listed, warn
 from bitymi_ns.safe_reading import open_regular, reading
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.trust import json_of
+from ..console import InputError, fail, listed, warn
 from .checkpoint_reader import read_archive
 from .checkpoint_schema import EXTRA_STATE, SURFELS, Entry, Misfit, check, check_unwritten
 

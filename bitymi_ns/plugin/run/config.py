@@ -21,14 +21,14 @@ from bitymi_ns import exit_messages
 from bitymi_ns.capture.readings import WRITTEN
 from bitymi_ns.capture.sfm_poses import has_kept_poses, kept_settings
 from bitymi_ns.files import write_errors_as, write_file
-from bitymi_ns.plugin import hooks
-from bitymi_ns.plugin.console import InputError, as_input_error, fail, say, warn
-from bitymi_ns.plugin.data.capture_checks import check_capture, read_early
-from bitymi_ns.plugin.data.datamanager import BitymiDataManagerConfig
-from bitymi_ns.plugin.data.dataparser import BitymiDataParserConfig
 from bitymi_ns.ranges import check_ranges
 from bitymi_ns.train.optimizers import BETAS, EPS, FIELD_BETAS, adam
 from bitymi_ns.train.preset import load_preset
+from .. import hooks
+from ..console import InputError, as_input_error, fail, say, warn
+from ..data.capture_checks import check_capture, read_early
+from ..data.datamanager import BitymiDataManagerConfig
+from ..data.dataparser import BitymiDataParserConfig
 from . import checkpoints, folder_lock, torchrun
 from .device import has_cuda_kernels, why_not_cuda
 from .model import PARAMETER_GROUPS, BitymiModelConfig

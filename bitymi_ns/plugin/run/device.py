@@ -7,7 +7,7 @@ from types import ModuleType
 
 import torch
 
-from bitymi_ns.plugin.console import warn_once
+from ..console import warn_once
 
 
 def has_cuda_kernels() -> bool:

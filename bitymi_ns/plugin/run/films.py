@@ -17,8 +17,8 @@ from PIL.PngImagePlugin import PngInfo
 
 from bitymi_ns.capture.kinds import RENDERED
 from bitymi_ns.files import complete_file, complete_folder, write_file
-from bitymi_ns.plugin.console import fail
 from bitymi_ns.scene.baked import as_bytes
+from ..console import fail
 
 RATES = (0.01, 1000.0)  # frames per second
 QUALITY = "18"  # constant rate factor: hardly visible loss
@@ -49,7 +49,8 @@ def film(path: Path, fps: float) -> Iterator[Add]:
             stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
             context = stream.codec_context
             context.colorspace, context.color_range = Colorspace.ITU709, ColorRange.MPEG
-            context.color_primaries, context.color_trc = ColorPrimaries.BT709, ColorTrc.BT709
+            context.color_primaries = ColorPrimaries.BT709
+            context.color_trc = ColorTrc.BT709
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image[:height, :width]), "rgb24")
         container.mux(stream.encode(frame.reformat(format="yuv420p", **standard)))
 

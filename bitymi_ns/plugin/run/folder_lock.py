@@ -8,8 +8,8 @@ from bitymi_ns import files, locks
 from bitymi_ns.capture.colmap_views import Source
 from bitymi_ns.capture.sfm_poses import write_kept_poses
 from bitymi_ns.capture.sfm_report import FILES
-from bitymi_ns.plugin.console import InputError, fail, warn
 from bitymi_ns.trust import check_no_links
+from ..console import InputError, fail, warn
 
 LOCK = ".lock"  # file of a training process
 POSES = "poses"  # subfolder of found poses and their report

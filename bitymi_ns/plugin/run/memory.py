@@ -13,8 +13,6 @@ from bitymi_ns.ops.capacity import NUMBERS, free_memory
 from bitymi_ns.ops.project import geometry_of
 from bitymi_ns.ops.trace_cpu import MOST, count
 from bitymi_ns.ops.view_kinds import VIEW_COLORS
-from bitymi_ns.plugin.console import say, warn
-from bitymi_ns.plugin.data.dataset import PHOTOGRAPH_BYTES
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.field import TexelField
@@ -32,6 +30,8 @@ from bitymi_ns.train.memory import (
 )
 from bitymi_ns.train.texels import SMALLEST, most_texels
 from bitymi_ns.train.views import DOWNSCALED_BYTES, photograph_budget
+from ..console import say, warn
+from ..data.dataset import PHOTOGRAPH_BYTES
 
 COUNTED_VIEWS = 3  # views with counted fragments
 MARGIN = 1.1  # other views may have more fragments

@@ -7,8 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from bitymi_ns.plugin.console import warn, warn_once
 from bitymi_ns.train.losses import color_fitted, psnr
+from ..console import warn, warn_once
 from . import lpips
 
 LPIPS = {"lpips": "alex", "lpips_vgg": "vgg"}
@@ -23,7 +23,8 @@ def image_metrics(
     images [H, W, 3] in [0, 1]; fitted_psnr, fitted_ssim and fitted_lpips of the `color_fitted` image; and
     mean_exposure_psnr and so on of the image without correction, if given. Pixels that a mask [H, W, 1] excludes are 0
     in all images, and left out of PSNR and fit."""
-    image, reference = image.detach().float().clamp(0.0, 1.0), reference.detach().float().clamp(0.0, 1.0)
+    image = image.detach().float().clamp(0.0, 1.0)
+    reference = reference.detach().float().clamp(0.0, 1.0)
     if mask is not None:
         mask = mask.to(image.device).bool().reshape(*image.shape[:2], 1)
         image, reference = image * mask, reference * mask

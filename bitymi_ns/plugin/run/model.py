@@ -16,8 +16,6 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns.ops.view_kinds import PARAMETERS
-from bitymi_ns.plugin.console import fail, say, warn
-from bitymi_ns.plugin.data.facts import CaptureFacts
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.field import HashField
@@ -29,6 +27,8 @@ from bitymi_ns.train.init import build_scene, limit_first_surfels
 from bitymi_ns.train.losses import photometric
 from bitymi_ns.train.poses import aligned, view_psnr
 from bitymi_ns.train.views import View, eval_background
+from ..console import fail, say, warn
+from ..data.facts import CaptureFacts
 from .callbacks import TrainingRun
 from .checkpoints import STATE_VERSION
 from .surfel_model import SurfelModel, SurfelModelConfig

@@ -15,11 +15,11 @@ from nerfstudio.utils import colormaps
 from torch import Tensor
 
 from bitymi_ns.files import check_folder, check_writable, reserved, size_text, write_errors_as
-from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, warn
-from bitymi_ns.plugin.data.cameras import to_camera
 from bitymi_ns.progress import rich_progress
 from bitymi_ns.ranges import spread
 from bitymi_ns.scene.baked import as_bytes
+from ..console import INTERRUPTED, InputError, fail, say, warn
+from ..data.cameras import to_camera
 from .camera_path import MOST_PIXELS, read_camera_path
 from .films import RATES, check_frames, film, frames
 from .surfel_model import SurfelModel
@@ -147,7 +147,8 @@ def interpolated(stock: Any, cameras: Cameras, **options: Any) -> Cameras:
 def with_principal_points(path: Cameras, found: dict[str, Any]) -> Cameras:
     """Give a path's cameras their `principal_point`, shares of width and height, which nerfstudio ignores."""
     points = torch.tensor([frame["principal_point"] for frame in found["camera_path"]]).float()
-    path.cx, path.cy = found["render_width"] * points[:, :1], found["render_height"] * points[:, 1:]
+    path.cx = found["render_width"] * points[:, :1]
+    path.cy = found["render_height"] * points[:, 1:]
     return path
 
 

@@ -17,12 +17,12 @@ from nerfstudio.models.base_model import Model, ModelConfig
 from torch import Tensor
 from torch.nn import Parameter
 
-from bitymi_ns.plugin.console import InputError, warn_once
-from bitymi_ns.plugin.data.cameras import normal_image, ray_distance, to_camera
-from bitymi_ns.plugin.data.dataset import POSE_STEP
 from bitymi_ns.scene.camera import Camera
 from bitymi_ns.scene.crop import Box
 from bitymi_ns.train.views import as_float, downscale_image, downscale_mask, over_background, shown
+from ..console import InputError, warn_once
+from ..data.cameras import normal_image, ray_distance, to_camera
+from ..data.dataset import POSE_STEP
 from .device import kernel_device
 from .metrics import image_metrics, render_milliseconds
 

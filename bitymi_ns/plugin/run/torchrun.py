@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 import torch
 import torch.distributed as dist
 
-from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail
 from bitymi_ns.train.processes import ALONE, Processes, ProcessLost, leave, raise_process_lost
 from bitymi_ns.trust import python_command
+from ..console import INTERRUPTED, InputError, fail
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig

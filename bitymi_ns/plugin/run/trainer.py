@@ -23,13 +23,13 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from bitymi_ns import exit_messages, files
-from bitymi_ns.plugin.console import INTERRUPTED, InputError, fail, say, step_bar, warn
-from bitymi_ns.plugin.data.cameras import to_cameras
-from bitymi_ns.plugin.data.dataset import capture_fingerprint, warn_of_other_capture
-from bitymi_ns.plugin.hooks import print_brackets
 from bitymi_ns.safe_reading import reading
 from bitymi_ns.train import optimizers
 from bitymi_ns.train.processes import ProcessesApart, ProcessLost
+from ..console import INTERRUPTED, InputError, fail, say, step_bar, warn
+from ..data.cameras import to_cameras
+from ..data.dataset import capture_fingerprint, warn_of_other_capture
+from ..hooks import print_brackets
 from . import checkpoints, folder_lock, torchrun
 from .checkpoint_schema import Entry, restore_optimizer
 from .model import BitymiModel
@@ -237,7 +237,8 @@ class BitymiPipeline(VanillaPipeline):
             fail(f"the checkpoint of step {step} does not fit this scene. {error}", error)
         if self.test_mode == "val" or not isinstance(self.model, BitymiModel):  # callbacks do this in training
             return
-        state, held_out = self.model.resume_state, to_cameras(self.datamanager.eval_dataset.cameras, "cpu")
+        state = self.model.resume_state
+        held_out = to_cameras(self.datamanager.eval_dataset.cameras, "cpu")
         warn_of_other_capture(state.get("capture"), capture_fingerprint(self.datamanager.train_dataset))
         if (poses := state.get("poses")) is not None and poses["motions"] is not None:
             self.model.carry = self.datamanager.move_cameras(poses["motions"])

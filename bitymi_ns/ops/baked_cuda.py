@@ -123,7 +123,7 @@ def compiled(scene: BakedSceneLike, photo_pixel: float = 1.0) -> Any:
     p = {name: value.detach().contiguous() for name, value in scene.surfels.items()}
     if "view_terms" in p:
         check_reduced(scene.view_color, p, len(scene.tiles))
-        colors = dict(zip(("base", "span", "lean"), (p[name] for name in REDUCED), strict=True))
+        colors = dict(zip(("base", "span", "reduced"), (p[name] for name in REDUCED), strict=True))
     else:
         terms = check_view_color(scene.view_color, p, len(scene.tiles))
         colors = lettered(VIEW_COLORS[scene.view_color].of(p)) | {"terms": terms}

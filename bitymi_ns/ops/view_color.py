@@ -111,7 +111,7 @@ def view_color(kind: str, params: Tensors, means: Tensor, center: Tensor, active
     if "view_terms" in params:
         base, span, terms = (params[name] for name in REDUCED)
         out, to = means.new_empty(n, 3), _directions(means, center, flags)
-        colors = {"base": dense(base, means), "span": span.contiguous(), "lean": dense(terms, means)}
+        colors = {"base": dense(base, means), "span": span.contiguous(), "reduced": dense(terms, means)}
         kernel("view_color_forward", means)(kind=kind, **colors, **to, out=out)
         return out
     terms = check_view_color(kind, params, n)

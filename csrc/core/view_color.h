@@ -78,7 +78,7 @@ template <class S> struct ReducedColors {
     r.choice("kind", kind, ViewColorKinds::kNames);
     r.array("base", base, 3 * n);
     r.array("span", span, 2 * n);
-    r.rows("lean", terms, count, reduced_width(kind));
+    r.rows("reduced", terms, count, reduced_width(kind));
   }
 };
 template <class S> BT_HD Vec3<S> view_color(const ReducedColors<S>& p, int64_t i, Vec3<S> d) {
@@ -94,7 +94,7 @@ template <class S> struct ViewColors {
   int64_t reduced_terms;  // of all surfels
 
   template <class R> void fields(R& r, int64_t n) {
-    if (r.has("lean"))
+    if (r.has("reduced"))
       reduced.fields(r, n, reduced_terms);
     else
       whole.fields(r, n);

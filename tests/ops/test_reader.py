@@ -71,7 +71,7 @@ def test_names_that_are_known_and_objects_of_the_module() -> None:
         kernels.field_forward_f32(field="none", x=torch.zeros(1, 3), rho=torch.zeros(1, 3))
     reduced = {
         "span": torch.tensor([[0, 2]] * n, dtype=torch.int32),
-        "lean": torch.zeros(1, 6),
+        "reduced": torch.zeros(1, 6),
         "out": torch.zeros(n, 3),
     }
     with pytest.raises(ValueError, match="the terms of surfel 0's view colour are not there"):

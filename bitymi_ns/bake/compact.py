@@ -229,7 +229,7 @@ def _alternatives(coder: Coder, chosen: RatePoint) -> list[tuple[float, float | 
 def _search(
     coder: Coder, excess: Callable[[RatePoint], float], progress: Progress, most: float = math.inf
 ) -> tuple[RatePoint, RatePoint]:
-    """Bisect lambda up to `most`, until the excess, about proportional to it, is 0.9 to 1: the last passing point (at
+    """Bisect lambda up to `most`, until the excess is 0.9 to 1: the last passing point (at
     most 1) and the first failing one, or the nearest tried."""
     low, high, points = None, None, {}
     lmbda = min(START, most)
@@ -243,6 +243,7 @@ def _search(
             break
         least = low or lmbda / 8
         largest = high or min(most, lmbda * 8)
+        # the excess is about proportional to lambda
         guess = 0.95 * lmbda / ratio if 0 < ratio < math.inf else 0.0
         if not 1.05 * least < guess < largest / 1.05:
             guess = math.sqrt(least * largest) if low and high else least if low is None else largest

@@ -22,7 +22,7 @@ FARTHEST = 1e9
 
 
 class NotesError(BundleError):
-    """A notes.json that is refused, or a crop that cannot be applied."""
+    """A notes.json that is refused, or a crop that cannot be applied; the rest of the bundle can be read."""
 
 
 def _printable(text: str) -> str:
@@ -194,7 +194,7 @@ def hides(bundle: str | Path) -> bool:
 
 
 def notes_of(bundle: str | Path) -> bytes | None:
-    """Read a bundle's notes.json for copying. Raises as `read_notes`."""
+    """Read a bundle's notes.json for copying, by no link out of the folder. Raises as `read_notes`."""
     with parts_of(bundle, inside=True) as parts:
         notes = read_notes(parts)
     return None if notes is None else notes[0]

@@ -78,9 +78,9 @@ def joined(bundle: str | Path) -> tuple[bytes, SingleFile]:
 
 
 def write_folder(bundle: str | Path, folder: Path, beside: Mapping[str, bytes]) -> list[str]:
-    """Write the files of a bundle to a missing or empty folder, atomically. `beside`: further files by name. Returns
-    `SingleFile.left_out`. Raises BundleError: as `write_single`, or the folder is occupied. Raises OSError: it cannot
-    be written."""
+    """Write the files of a bundle, a folder or single file, to a missing or empty folder, atomically. `beside`: further
+    files by name, not covered by bundle.json. Returns `SingleFile.left_out`. Raises
+    BundleError: as `write_single`, or the folder is occupied. Raises OSError: it cannot be written."""
 
     def check() -> None:
         if os.path.lexists(folder) and not (folder.is_dir() and not any(folder.iterdir())):

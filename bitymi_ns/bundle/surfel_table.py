@@ -3,7 +3,8 @@
 The names of 3D Gaussian splatting come first, so that its viewers show a sensible colour: x y z, f_dc_0..2, opacity
 (logit), scale_0..2 (log; scale_2 = -31, a flat disc), rot_0..3 (wxyz, unit). Then beta (raw), the view colour as
 `<parameter>_<i>` in C order, the tile rectangle tile_x, tile_y, tile_layer, tile_ru, tile_rv, its half side in scale
-units, tile_extent, and the mean residual residual_0..2. Texels with alphas add alpha, their mean.
+units, tile_extent, and the mean residual residual_0..2. Texels with alphas add alpha, their mean. A surfel
+without a tile is drawn with its means.
 
 Reduced view colours (`ops.view_color.REDUCED`) have view_base_0..2 and view_terms (number of terms) instead; the terms,
 surfel after surfel, are rows of a second element, `view_term`: term_0, term_1, ...

@@ -42,7 +42,7 @@ class WorldEntry(Part):
 
 
 def same_frame(a: WorldEntry, b: WorldEntry) -> bool:
-    """Test if two scenes have the same frame, to a thousandth."""
+    """Test if two scenes have the same frame, to a thousandth of their unit."""
     return np.allclose(*(world.scale * np.array(world.transform) for world in (a, b)), rtol=1e-3, atol=1e-3)
 
 

@@ -76,7 +76,8 @@ def _texel_rows(packing: Packing) -> Iterator[tuple[Tensor, Tensor]]:
 
 
 def listed_texels(pages: Tensor, packing: Packing, constants: Tensor) -> Tensor:
-    """Gather pages [layers, height, width, C] into a texel list [T, C]; `constants`: [N, C], without a tile."""
+    """Gather pages [layers, height, width, C] into a texel list [T, C]; `constants`: [N, C], of surfels
+    without a tile."""
     area = torch.from_numpy(packing.tiles[:, 3:]).long().clamp(min=1).prod(dim=1)
     texels = constants.repeat_interleave(area, dim=0)
     for listed, paged in _texel_rows(packing):

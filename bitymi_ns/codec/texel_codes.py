@@ -174,7 +174,7 @@ class SceneCodes:
 
     surfels: SurfelCodes  # of N surfels
     texels: TexelCodes | None  # None without tiles
-    residual: npt.NDArray[np.int64]  # [N, 3] mean residuals: green, red - green, blue - green
+    residual: npt.NDArray[np.int64]  # [N, 3] mean residuals in steps: green, red - green, blue - green
     residual_step: float  # colour units
     # page_width, page_rows: arguments of `packing.pack`
     page_width: int

@@ -103,11 +103,10 @@ def write_extras(
     progress: Progress = no_progress,
 ) -> dict[str, ExtraFile]:
     """Write a folder, complete or not at all, with a file per kind and extras.json, which states them; return these by
-    kind. `bundle`: on the CPU, texels decoded. `frame`: of the files: the scene's, or the
-    capture's by bundle.json. `cameras`: of the training photographs, to fit
-    colours to; without any, harmonics are fitted over the whole sphere, and a mesh keeps the surfels' colours. Raises
-    BundleError: as `check_extras`; there is no surfel for a mesh; the transform to the capture's frame is no
-    similarity; or the folder cannot be written."""
+    kind. `bundle`: on the CPU, texels decoded. `frame`: of the files: the scene's, or the capture's by
+    bundle.json. `cameras`: of the training photographs, to fit colours to; without any, harmonics are fitted over the
+    whole sphere, and a mesh keeps the surfels' colours. Raises BundleError: as `check_extras`; there is no surfel for a
+    mesh; the transform to the capture's frame is no similarity; or the folder cannot be written."""
     folder = Path(folder)
     reserve_extras(kinds, folder, overwrite)
     to = to_capture(bundle.info.world) if frame == "capture" else None

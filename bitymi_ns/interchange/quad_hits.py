@@ -1,4 +1,4 @@
-"""Nearest quads of a mesh at the pixels of a view, by a depth buffer with alpha mask."""
+"""Nearest quads of a mesh at the pixels of a view, by a depth buffer with alpha mask, on the CPU."""
 
 import math
 from collections.abc import Iterator

@@ -39,7 +39,8 @@ def fit_colors(scene: BakedScene, residual: Tensor | None, seen: Tensor, centers
     """Fit spherical harmonics to the colours of surfels, by least squares over directions.
 
     The colour is max(max(f_view(d) + 0.5, 0) + residual, 0). Directions are those of `bake.directions`, with a total
-    weight of 1, and OUTSIDE directions over the whole sphere with a total weight of OUTSIDE_WEIGHT. `scene`: N surfels
+    weight of 1, and OUTSIDE directions over the whole sphere with a total weight of OUTSIDE_WEIGHT; for a
+    surfel that no view shows, these alone. `scene`: N surfels
     on the CPU. `residual`: [N, 3]; None: 0. `seen`: [V, N] bool; V may be 0. `centers`: [V, 3] float64 camera centres,
     the scene's frame."""
     surfels = scene.surfels

@@ -40,8 +40,8 @@ class Sheet(NamedTuple):
 
     @classmethod
     def of(cls, pages: int, height: int, width: int) -> Sheet:
-        """Lay out pages of equal size in columns of up to 2^14 rows, which every texture format allows; coordinates
-        keep the texture unit's fractional bits."""
+        """Lay out pages of equal size in columns of up to 2^14 rows, which every texture format allows and which
+        keeps the texture unit's fractional bits of coordinates."""
         height, width = -(-height // 4) * 4, -(-width // 4) * 4  # corners on the grid of the coarsest level
         return cls(max(1, min(pages, 2**14 // height)), width, height)
 

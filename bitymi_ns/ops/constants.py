@@ -27,7 +27,7 @@ TRANSMITTANCE_MIN: float = _compiled("TRANSMITTANCE_MIN")
 BETA_MAX: float = _compiled("BETA_MAX")  # beta = BETA_MAX sigmoid(beta_raw)
 COLOR_BIAS: float = _compiled("COLOR_BIAS")  # added to f_view before the inner ReLU
 SH_C0: float = _compiled("SH_C0")  # spherical harmonic of degree 0
-LOG_TAU_MAX: float = _compiled("LOG_TAU_MAX")  # of temperatures and sharpnesses
+LOG_TAU_MAX: float = _compiled("LOG_TAU_MAX")  # of logarithms of temperatures and sharpnesses
 MAX_TERMS: int = _compiled("MAX_TERMS")  # most sites or lobes of a view colour
 FEATURES: int = _compiled("FEATURES")  # features per level of the field
 WIDTH: int = _compiled("WIDTH")  # of both hidden layers of the field

@@ -54,7 +54,7 @@ class Projection:
     camera: CameraLike
     near: float  # nearest depth that is drawn, camera z
     broken: Tensor  # [1] int32, number of surfels dropped because a parameter is NaN or infinite
-    photo_pixel: float = 1.0  # side of a photograph's pixel in pixels of the view; not 1 in the baked renderer only
+    photo_pixel: float = 1.0  # side of a photograph's pixel in pixels of the view; other than 1: for baked scenes
     # [N, 2] after backward: gradient with respect to the projected centre, in pixels; and with absolute values per
     # fragment before the sum
     mean2d_grad: Tensor | None = None

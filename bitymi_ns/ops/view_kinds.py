@@ -33,21 +33,22 @@ class ViewColor:
     kept: str
     parameters: tuple[Parameter, ...]  # two or three, in the kernels' order; the second has one row per term
     counts: Collection[int]  # allowed numbers of terms
-    rule: str  # the same for messages, counting rows of the second parameter
+    rule: str  # the same in words, for messages, counting rows of the second parameter
     base_terms: int  # terms that the base of a reduced colour replaces: 1, or 0 if it is additional
     option: str  # option of `SceneConfig` for the number of terms,
     terms_of: Callable[[int], int]  # and the number of terms for its value
-    # initial parameters from colours [N, 3] less `COLOR_BIAS`, which f_view is in every direction or on average, the
-    # number of terms and a random generator
+    # initial parameters from colours [N, 3] less `COLOR_BIAS`, the number of terms and a random generator; f_view is
+    # that colour in every direction, or on average
     start: Callable[[Tensor, int, torch.Generator], tuple[Tensor, ...]]
     reduced_width: int  # numbers of a reduced term
     reduced_limit: Limit  # of a reduced term, allowed in a bundle
     reduced_formula: str  # evaluation of a reduced colour, for bundle.json
     reduced_counts: Collection[int] = range(MAX_TERMS + 1)  # allowed numbers of reduced terms of a surfel
     base_unit: float = 1.0  # colour for a base of 1
-    # mean of f_view over all directions [N, 3], for display; None: no closed form
+    # mean of f_view over all directions [N, 3] from the parameters, for display; None: no closed form
     mean: Callable[..., Tensor] | None = None
-    # v and rgb [N, K, 3] of the form softmax_k(v_k . d) rgb_k, of which the bake can fit fewer; None: no such form
+    # v and rgb [N, K, 3] of the form softmax_k(v_k . d) rgb_k, from the parameters, of which the bake can fit fewer;
+    # None: no such form, a surfel keeps all terms or one colour
     sites: Callable[..., tuple[Tensor, Tensor]] | None = None
     stated: str | None = None  # key for the number of terms in bundle.json's surfels; None: not stated
 

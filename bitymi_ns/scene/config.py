@@ -25,8 +25,8 @@ class SceneConfig:
     lobes: Annotated[int, Field(ge=1, le=MAX_TERMS)] = 2
     """Number of lobes per surfel of the Spherical Beta and spherical Gaussian colours, 1 to 32."""
     texture: Texture = "hash"
-    """Residual colours: hash = a field in space (hash grid and MLP); texels = on every surfel, trained in the last part
-    of the run (train.texels); none = no residual."""
+    """Residual colours: hash = a field in space (hash grid and MLP); texels = texels on every surfel, trained in the
+    last part of the run (train.texels); none = no residual."""
     levels: Annotated[int, Field(ge=1, le=MAX_LEVELS)] = 4
     """Hash grid levels, 1 to 4, with resolutions min_resolution * 2^level; the paper's 4."""
     min_resolution: Annotated[int, Field(ge=2, le=1 << 20)] = 256

@@ -74,7 +74,8 @@ class DensifyConfig:
     pixels_per_surfel: NonNegative = 150.0
     """Densification stops at one surfel per this many pixels of all training photographs; 0 = no limit."""
     growth: NonNegative = 4.0
-    """Growth to this many times the initial number of surfels is allowed despite `pixels_per_surfel`."""
+    """Growth to this many times the initial number of surfels is allowed despite `pixels_per_surfel`: a scene needs
+    some to add surfels where its errors are."""
     max_surfels: Annotated[Count, tyro.conf.arg(aliases=("--max-surfels",))] = 0
     """Number of surfels that densification grows to, never exceeded, instead of `pixels_per_surfel`; 0 = the thresholds
     decide. The prunes after the last densification leave a quarter to two fifths fewer."""

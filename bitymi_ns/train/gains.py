@@ -109,7 +109,8 @@ def _disagreement(logs: Tensor) -> float:
 
 
 def _median(values: Tensor, dim: int) -> Tensor:
-    """Compute the median along a dimension without NaN; NaN if empty. torch's lower median would be biased."""
+    """Compute the median along a dimension without NaN, the mean of the middle two for even counts; NaN if empty.
+    torch's lower median would be biased."""
     if values.shape[dim] == 0:
         return torch.full_like(values.sum(dim), math.nan)
     return 0.5 * (values.nanmedian(dim).values - (-values).nanmedian(dim).values)

@@ -21,8 +21,8 @@
 
 namespace bt {
 
-// Threads of the kernels: as set, else OpenMP's; one in a forked child, whose OpenMP would wait for
-// threads of its parent.
+// Threads of the kernels: as set, else OpenMP's; one in a forked child, whose OpenMP would wait for threads
+// of its parent.
 int num_threads();
 void set_num_threads(int n);
 void use_one_thread_after_fork();  // registers the above

@@ -47,6 +47,7 @@ def test_what_would_be_refused_is_not_written(surfels, tmp_path, change, options
 def test_alphas_without_their_means_are_not_written(surfels, tmp_path, means, reason):
     with pytest.raises(BundleError, match=reason):
         make(surfels, tmp_path / "b", alpha=True, mean_alpha=means)
+    assert list(tmp_path.iterdir()) == []
 
 
 def failures(folder):

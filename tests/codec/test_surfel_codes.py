@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from bitymi_ns.codec.limits import EXTENTS, LIMITS
-from bitymi_ns.codec.surfel_codes import REFERENCE, code_surfels, reordered
+from bitymi_ns.codec.surfel_codes import POSITION_BITS, REFERENCE, code_surfels, reordered
 from bitymi_ns.ops.view_color import view_color
 from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere
 from tests.bundle.compact_scene import reduced_surfels
@@ -15,6 +15,7 @@ COUNT = 200
 
 @pytest.mark.parametrize("kind", sorted(VIEW_COLORS))
 def test_values_are_within_half_a_step(kind: str) -> None:
+    assert 3 * POSITION_BITS <= 53  # exact in float64, as the page reads them
     params = reduced_surfels(kind, COUNT)
     fine = {name: step / 64 for name, step in REFERENCE.items()}
     sizes = torch.tensor([[8, 4]] * COUNT)

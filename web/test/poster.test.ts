@@ -1,5 +1,5 @@
 import { describe, expect, it } from 'vitest';
-import { loadPoster, isPoster } from '../src/bundle/poster';
+import { loadPoster, loadPreview, isPoster } from '../src/bundle/poster';
 import { parseManifest } from '../src/bundle/manifest';
 import type { Source } from '../src/bundle/source';
 
@@ -14,7 +14,11 @@ const changed = (at: number, value: number): ArrayBuffer => {
 };
 const HASH = '0'.repeat(64);
 
-async function posterOf(files: object, answer: () => Promise<ArrayBuffer>): Promise<Blob | null> {
+async function pictureOf(
+  load: typeof loadPoster,
+  files: object,
+  answer: () => Promise<ArrayBuffer>,
+): Promise<Blob | null> {
   const info = parseManifest(
     JSON.stringify({
       format: 'bitymi-bundle',
@@ -26,8 +30,22 @@ async function posterOf(files: object, answer: () => Promise<ArrayBuffer>): Prom
       files,
     }),
   );
-  return loadPoster({ read: answer } as unknown as Source, info);
+  return load({ read: answer } as unknown as Source, info);
 }
+
+const posterOf = (files: object, answer: () => Promise<ArrayBuffer>): Promise<Blob | null> =>
+  pictureOf(loadPoster, files, answer);
+
+describe('a preview', () => {
+  it('is the first one of moderate size', async () => {
+    const data = bytes();
+    const digest = new Uint8Array(await crypto.subtle.digest('SHA-256', data));
+    const sha256 = [...digest].map((byte) => byte.toString(16).padStart(2, '0')).join('');
+    const files = { 'preview.jpg': { bytes: 2 ** 30, sha256: HASH }, 'preview.png': { bytes: data.length, sha256 } };
+    const found = await pictureOf(loadPreview, files, () => Promise.resolve(data.buffer));
+    expect(found?.type).toBe('image/png');
+  });
+});
 
 describe('a poster', () => {
   it('is a lossy WebP picture of moderate size', () => {

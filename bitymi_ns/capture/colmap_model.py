@@ -72,7 +72,8 @@ def read_model(folder: Path) -> Model:
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a binary model and read it back, as COLMAP ignores failed writes. Raises OSError: a file is incomplete."""
+    """Write a binary model and read it back, as COLMAP ignores failed writes; by this reader, as COLMAP's
+    does not end on some truncated files. Raises OSError: a file is incomplete."""
     try:
         model.write_binary(folder)
         for name, read in BINARY.items():

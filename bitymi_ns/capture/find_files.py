@@ -125,7 +125,7 @@ def _smaller_copies(files: Iterable[Path]) -> str:
     """Say how to use copies of missing photographs in a folder such as `images_2`; empty = there are none."""
     for file in files:
         for factor in (2, 4, 8, 16):
-            folder = file.parent.with_name(f"{file.parent.name}_{factor}")
+            folder = Path(f"{os.path.abspath(file.parent)}_{factor}")
             if os.path.isfile(folder / file.name):
                 return f" Or use their copies in {folder}: `bitymi-data --downscale-factor {factor}`."
     return ""
@@ -171,7 +171,7 @@ def report_files(path: Path, names: Sequence[str], files: Sequence[Path], masks:
     pictures = dict.fromkeys(Path(os.path.normpath(file)) for file in (*files, *masks) if file is not None)
     outside = [file for file in pictures if not file.is_relative_to(folder) and os.path.isfile(file)]
     if outside:
-        warn(f"{path} names pictures outside of its folder: {listed(outside)}.")
+        warn(f"{path} names pictures outside of its folder, which are read there: {listed(outside)}.")
 
 
 def find_photographs(path: Path, names: Sequence[str], need_photos: bool) -> list[Path]:

@@ -125,7 +125,8 @@ def _by_gravity(model: pycolmap.Reconstruction, ups: Mapping[str, tuple[float, f
 
 
 def _by_gps(centers: np.ndarray, positions: np.ndarray) -> tuple[pycolmap.Sim3d, np.ndarray] | None:
-    """Align centers with positions [n, 3] in metres, and mark those that agree [n]; None = they determine nothing."""
+    """Align centers with positions [n, 3] in metres, and mark those that agree [n]. None = they
+    are too few, too close together, on one line, or of another shape than centers [n, 3]."""
     if len(positions) < 3:
         return None
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False) / np.sqrt(len(positions))

@@ -81,8 +81,9 @@ def exposure_stops(paths: Sequence[Path]) -> list[float]:
 
 
 def read_image(path: Path, stored: tuple[int, int] | None = None, wanted: tuple[int, int] | None = None) -> Image.Image:
-    """Read a photograph of `stored` size (None = any) as 8-bit sRGB, mode RGB, or RGBA with transparency, reduced to
-    the size `wanted` by pixel averages. Raises CaptureError: it is missing, damaged, or of another size."""
+    """Read a photograph of `stored` size (width, height; None = any) as 8-bit sRGB, mode RGB, or RGBA with
+    transparency, reduced to the size `wanted` by pixel averages. Raises CaptureError: it is missing, damaged, or of
+    another size."""
     try:
         with parsing(f"the image {path}", _REPLACE, _WORDED), open_picture(path) as file:
             if stored is not None and file.size != stored:

@@ -30,7 +30,8 @@ def triangulate(
     capture: Path, views: Sequence[Photograph], progress: Progress | None = None, tell: Tell = warnings.warn
 ) -> Path:
     """Triangulate points from photographs with known poses, and cameras in pixels of the files; return the folder of a
-    COLMAP model in their world, with names relative to `capture`. Raises CaptureError: there are too few points."""
+    COLMAP model in the world of the poses, kept beside the capture, with names relative to `capture`.
+    Raises CaptureError: there are too few points."""
     check_photographs_exist(capture, [view.file for view in views])
     if len(views) < 2:
         fail(f"{capture}: points need at least two photographs with poses, these are {len(views)}")

@@ -185,7 +185,7 @@ def lenses_of(colmap: ColmapCamera, stored: tuple[int, int], label: str) -> list
     share = w * h / (width * height)
     if share < ABSURD_AREA or min(w, h) < 1:
         what = f"{model} {camera.params_to_string()} would leave {100.0 * share:.2g} % of the picture"
-        fail(f"the lens distortion of {label} is absurd: {what}. Correct it, or calibrate anew.")
+        fail(f"the lens distortion of {label} is absurd: {what}. Correct it, or calibrate a SIMPLE_RADIAL camera.")
     pinhole = Pinhole(*focal, left * focal[0], top * focal[1], w, h)
     wide = max(pinhole.view) > MAX_VIEW_ANGLE - 0.5
     return _faces(colmap, stored) if wide else [replace(lens, pinhole=pinhole)]

@@ -67,7 +67,7 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
     for frame, name in zip(frames, names, strict=True):
         pose = as_matrix(frame["transform_matrix"])
         if pose is None:
-            fail(f"{path}: the transform_matrix of {name} is not 4 x 4 finite numbers. Correct it.")
+            fail(f"{path}: the transform_matrix of {name} is not 4 x 4 finite numbers. Correct it or remove the frame.")
         if pose[3, 3] and not pose[3, :3].any():
             scaled += [name] * bool(abs(pose[3, 3] - 1.0) > 1e-6)  # numpy 2.5 multiplies no list by its own
             pose = pose / pose[3, 3]  # homogeneous
@@ -84,7 +84,7 @@ def correct_poses(path: Path, frames: list[dict[str, Any]]) -> None:
         before = first.setdefault(name, i)
         if not np.allclose(matrices[before], pose, rtol=1e-5, atol=1e-5):
             twice = f"frames {before} and {i} (counted from 0) are both of {name}, with different poses"
-            fail(f"{path}: {twice}. Correct one or remove it.")
+            fail(f"{path}: {twice}. Correct the name of one or remove it.")
         frame["transform_matrix"] = pose.tolist()
 
 
@@ -103,7 +103,7 @@ def warn_of_mirrored(rotations: npt.NDArray[np.float64], names: Sequence[object]
     few = mirrored if 2 * mirrored.sum() <= len(mirrored) else ~mirrored
     if few.any():
         which = f"{listed([names[i] for i in few.nonzero()[0]])} is mirrored against the other frames"
-        warn(f"{which} by its pose. If the photograph is not mirrored, too, that is wrong.")
+        warn(f"{which} by its pose. If the photograph is not mirrored, too, the pose is wrong.")
 
 
 def check_spread(centers: npt.NDArray[np.float64], source: str) -> None:
@@ -152,7 +152,8 @@ def fit_scale(frame: FrameOptions, photographs: Sequence[Photograph], source: st
 def check_point_unit(
     points: npt.NDArray[np.float64], centers: npt.NDArray[np.float64], widths: npt.NDArray[np.float64]
 ) -> None:
-    """Warn if points [N, 3] seem to be in another unit than cameras [M, 3], with `widths` [M] in focal lengths."""
+    """Warn if points [N, 3] seem to be in another unit than finite cameras [M, 3], with `widths` [M] in focal lengths:
+    far beyond them, or in a spot of the pictures."""
     points = points[:: max(1, len(points) // 100_000)]
     points = points[np.isfinite(points).all(1)]
     if len(points) == 0:

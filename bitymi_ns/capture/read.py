@@ -218,7 +218,7 @@ class _Reader:
             frame = replace(frame, orientation_method=method)
             say(f"{read.path} asks for the orientation method {method}.")
         if auto and "ply_file_path" in meta:
-            hint = f"Put it there again, or remove ply_file_path from {read.path} to start from random points."
+            hint = "Put it there again, or start from random points: `bitymi-data --points random`."
             path = found.folder / meta["ply_file_path"]
             own = self._colored(*read_cloud(path, hint), photographs, path)
         elif model is not None and applied is not None:

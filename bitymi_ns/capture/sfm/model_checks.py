@@ -18,7 +18,8 @@ FEW_FEATURES = 60  # features of a photograph with hardly any detail
 PARALLAX = 1.0  # largest parallax (`parallax`) of photographs from one spot, degrees
 ROTATED = 2.0  # error up to which a rotation explains a match, in pixels of the images with features
 MOST = 0.9
-"""Least share of a pair's matches, and of the pairs, that a rotation explains if the camera only turned."""
+"""Least share of a pair's matches, and of the pairs, that a rotation explains if the camera only turned; fewer if it
+moves before a far background."""
 PAIRS_TRIED = 60
 TELLING = 30  # fewest matches of a pair that tell a rotation from a translation
 GUESSES = (0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0, 3.0)  # unknown focal lengths, in longer sides
@@ -154,7 +155,8 @@ def _turn_errors(a: np.ndarray, b: np.ndarray, focal: float) -> np.ndarray:
 
 
 def drop_unlinked(model: pycolmap.Reconstruction) -> None:
-    """Remove the poses of cameras that too few points link to the largest group: filters may have removed theirs."""
+    """Remove the poses of cameras that too few points link to the largest group: mappers register
+    them by directions between pairs, whose points the filters may have removed."""
     placed = [image for image in model.images.values() if image.has_pose]
     column = {image.image_id: i for i, image in enumerate(placed)}
     tracks = [sorted({column[e.image_id] for e in p.track.elements}) for p in model.points3D.values()]

@@ -76,7 +76,7 @@ def _watched(database: Path, table: str, progress: Progress, stage: str, total: 
 
 
 def rows(database: Path, table: str) -> int:
-    """Count the rows of a table; 0 if it cannot be read."""
+    """Count the rows of a table; 0 if it cannot be read. Not in a process in which COLMAP has the database open."""
     where = f"{database.absolute().as_uri()}?mode=ro"
     with suppress(sqlite3.Error), closing(sqlite3.connect(where, uri=True, timeout=5)) as connection:
         return connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0]
@@ -100,7 +100,7 @@ def _why_ended(work: Path, source: Path, code: int) -> str:
     signs = ("disk is full", "No space left", "disk I/O error", "File too large", "readonly database")
     full = any(sign in log for sign in signs)
     if full or free < LITTLE_SPACE:
-        full_disk = f"disk or quota is full ({size_text(free)} free)"
+        full_disk = f"disk or quota is full ({size_text(free)} free on the disk)"
         return f"{work} cannot be written: {full_disk}. Free some space, and start again: what is done is kept"
     if "database disk image is malformed" in log:
         delete_work(work)

@@ -34,8 +34,8 @@ class BenchRun:
     extra: str = ""
     """Further options of ns-train for every run, as one word: --extra="--pipeline.model.scene.weight-bound 0"."""
     seeds: tuple[int, ...] = ()  # Train once per seed; none = once, with the method's own.
-    steps: int | None = None  # Length of a training. None = the method's own.
-    formats: tuple[Format, ...] = get_args(Format)  # Bundle formats to bake each trained scene to.
+    steps: int | None = None  # Steps of a training; schedules scale with it. None = the method's own.
+    formats: tuple[Format, ...] = get_args(Format)  # Bundle formats to bake each trained scene to; none = no baking.
     work: Path = Path("outputs/bench")
     """Folder of runs, bundles, logs and finished cells, which are not run again. Processes on different GPUs or
     machines may share it: each takes runs that no other is working on."""

@@ -78,7 +78,8 @@ def curve_from(lines: list[dict[str, Any]], source: Path) -> Curve:
 
 def link(records: Records) -> None:
     """Make labels unique; add to evaluations of files the training times of the only curve of their scene and method,
-    and to bundles the difference from the only trained scene (`psnr_delta`) of these, or in the same folder."""
+    and to bundles the difference from their trained scene (`psnr_delta`): the only one of the same scene and method, or
+    in the same folder."""
     disambiguate(records.evaluations)
     disambiguate(records.curves)
     of_files = [row for row in records.evaluations if not row.series]  # those of a benchmark state both

@@ -205,7 +205,7 @@ def new_scene(
     xyz = xyz.float()
     declared = None if scene_box is None or not facts.declares_box else _corners(scene_box)
     box = None
-    advice = "remove ply_file_path from transforms.json to start from random points."
+    advice = "start from random ones: `bitymi-data --points random`."
     if not bool(torch.isfinite(xyz).all(1).any()):
         if len(xyz):
             fail(f"all {len(xyz)} points of the capture are NaN or infinite. Make them again, or {advice}")

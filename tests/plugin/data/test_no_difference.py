@@ -160,7 +160,7 @@ UNIT = "The point cloud seems to be in another unit than the poses: half of the 
 SAID: list[tuple[Form, str, Change, str]] = [
     *((form, "", entry(lambda meta: (meta.update(fisheye_crop_radius=12.0), meta["frames"][2].update(rotation=0.1))),
        "that are not used: fisheye_crop_radius.") for form in JSON),
-    *((form, "", elsewhere, "names pictures outside of its folder: ") for form in JSON),
+    *((form, "", elsewhere, "names pictures outside of its folder, which are read there: ") for form in JSON),
     (nerfstudio, "", entries(fl_x=4.2), "is 4.2 pixels (fl_x): 48 pixels of the picture span 160 deg"),
     (nerfstudio, "", entry(lambda meta: meta.update(frames=meta["frames"][:5])), "Only 4 training views"),
     (nerfstudio, "", pose(lambda part: part * [-1, 1, 1]), "frame_00004.png is mirrored against the other frames"),

@@ -41,6 +41,7 @@ class FileFinder:
     folder: Path  # to which names are relative
     outside: bool = False  # allow names that lead out of it
     extensions: tuple[str, ...] = PHOTOGRAPHS  # of the files
+    deep: bool = True  # search subfolders, too
 
     def find(self, name: str) -> Path | None:
         """Find a file; None = none, or several."""
@@ -96,6 +97,8 @@ class FileFinder:
     def _whole(self) -> dict[Parts, list[Path]]:
         table, paths = defaultdict(list), []
         for folder, below, files in os.walk(self.folder):
+            if not self.deep:
+                below.clear()
             below[:] = [name for name in below if not name.startswith(".") and not result_in(Path(folder, name))]
             paths += [Path(folder, name) for name in files if name.lower().endswith(self.extensions)]
         for path in sorted(paths):
@@ -146,7 +149,8 @@ def _hint(folder: Path, file: Path, named: Sequence[Path]) -> str:
         return " (a link to nothing)"
     if os.path.exists(file):
         return " (not a file)"
-    finder = FileFinder(file.parent if os.path.isdir(file.parent) else folder)
+    there = file.parent if os.path.isdir(file.parent) else folder
+    finder = FileFinder(there, deep=there.is_relative_to(folder))  # elsewhere may be a whole disk
     near = finder.nearest(file.name, [path.name for path in named])
     return f" ({near})" if near else ""
 

@@ -35,7 +35,7 @@ PARTS = {
 }
 """Parts of bundle.json that the page reads."""
 TYPES = {
-    "EARLIER": "Record<string, string>",
+    "EARLIER": "Record<string, readonly string[]>",
     "LATER": "readonly string[]",
     "REDUCED_COUNTS": "Record<string, readonly number[] | null>",
     "LINEAR": "Record<string, { words: readonly number[]; limit: number } & Record<'least' | 'absent', number | null>>",

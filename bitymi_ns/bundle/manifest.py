@@ -27,8 +27,8 @@ FORMAT = "bitymi-bundle"
 SURFELS, ATLAS, MANIFEST = "surfels.ply", "atlas.ktx2", "bundle.json"
 COMPACT_SURFELS, TEXELS = "surfels.bin", "texels.bin"
 VERSION = "6.0"
-EARLIER = {"1.4": SURFELS, "2.3": SURFELS, "4.0": SURFELS, "5.0": COMPACT_SURFELS}
-"""Versions that are read as `VERSION`, and their file of surfels: whole view colours, reduced ones, alphas of texels,
+EARLIER = {"1.4": (SURFELS,), "2.3": (SURFELS,), "4.0": (SURFELS,), "5.0": (COMPACT_SURFELS,)}
+"""Versions that are read as `VERSION`, and their files of surfels: whole view colours, reduced ones, alphas of texels,
 entropy-coded columns."""
 POSTER = "poster.webp"  # optional picture of a viewer's first view: `bundle.poster`
 ACTIVATIONS = {"opacity": "sigmoid", "scale": "exp", "beta": "4 * sigmoid", "rotation": "wxyz, unit"}
@@ -294,5 +294,5 @@ def _check_version(info: Mapping[str, Any], source: str) -> None:
     if int(match[1]) > int(newest):
         raise BundleError(f"{stated}, this program reads up to {newest}.x: update bitymi-ns to open it")
     file = surfels.get("file", SURFELS) if isinstance(surfels, dict) else None
-    if match[1] != newest and EARLIER.get(match[0]) != file:
+    if match[1] != newest and file not in EARLIER.get(match[0], ()):
         raise BundleError(f"{stated} with {short(file)}, which is read no longer: export it again")

@@ -181,7 +181,7 @@ export function parseManifest(text: string) {
       .map(([name, r]) => [name, { bytes: r.whole('bytes'), sha256: r.text('sha256', /^[0-9a-f]{64}$/) }]),
   );
   const isCompact = files.has('surfels.bin');
-  if (major < NEWEST_MAJOR && EARLIER[version] !== (isCompact ? 'surfels.bin' : 'surfels.ply')) {
+  if (major < NEWEST_MAJOR && !EARLIER[version]?.includes(isCompact ? 'surfels.bin' : 'surfels.ply')) {
     throw new ViewerError(
       'This bundle is of a version that is read no longer',
       `It has version ${version}.`,

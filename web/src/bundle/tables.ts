@@ -1,8 +1,8 @@
 // Written by scripts/page_tables.py.
 export const FORMAT = 'bitymi-bundle';
 export const NEWEST_MAJOR = 6;
-export const EARLIER: Record<string, string> = {
-  '1.4': 'surfels.ply', '2.3': 'surfels.ply', '4.0': 'surfels.ply', '5.0': 'surfels.bin',
+export const EARLIER: Record<string, readonly string[]> = {
+  '1.4': ['surfels.ply'], '2.3': ['surfels.ply'], '4.0': ['surfels.ply'], '5.0': ['surfels.bin'],
 };
 export const RANGES: Record<string, readonly [number, number]> = {
   'surfels.count': [0, 2147483647], 'surfels.sites': [0, 2147483647], 'surfels.terms': [0, 2147483647],

@@ -9,7 +9,6 @@ from bitymi_ns.ops.view_kinds import kind_of
 from bitymi_ns.ply import PlyError
 from bitymi_ns.scene.baked import BakedScene
 
-KINDS = ["sv", "sh", "sb", "sg"]
 TILES = np.arange(25, dtype=np.int32).reshape(5, 5)
 
 
@@ -17,7 +16,7 @@ def columns_of(params, tiles=TILES, **means):
     return to_columns(BakedScene(params, kind_of(params), torch.from_numpy(tiles), **means))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", VIEW_COLORS)
 def test_surfels_survive_the_columns(surfels, kind):
     params = surfels(5, kind)
     columns = columns_of(params)
@@ -51,7 +50,7 @@ def test_viewers_see_the_mean_colour_with_the_mean_of_the_tile(surfels):
     assert 0.5 + SH_C0 * bright["f_dc_0"][0] == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", VIEW_COLORS)
 def test_mean_view_colours_match_a_sum_over_the_sphere(surfels, kind):
     reference = pytest.importorskip("bitymi_ns.ops.reference.view_color")
     params = surfels(1, kind)

@@ -14,6 +14,7 @@ from bitymi_ns.bundle import write as bundle_module
 from bitymi_ns.bundle.cameras import CapturedCamera, cameras_data
 from bitymi_ns.bundle.parts import check_target
 from bitymi_ns.ops.reference import view_color as reference
+from bitymi_ns.ops.view_kinds import VIEW_COLORS
 from tests.bake.scenes import write
 from tests.bundle.damage import amend
 from tests.bundle.made import make
@@ -78,7 +79,7 @@ def test_alphas_are_read_as_they_were_written(surfels, tmp_path, format, reduced
     assert float((loaded.scene.residuals() - torch.from_numpy(texels[..., :3])).square().mean()) < 2 * atlas.mse
 
 
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+@pytest.mark.parametrize("kind", VIEW_COLORS)
 def test_reduced_view_colours_are_read_as_they_were_written(surfels, tmp_path, kind):
     params, *_ = make(surfels, tmp_path / "b", kind, None, reduced=True)
     loaded = read_bundle(tmp_path / "b")

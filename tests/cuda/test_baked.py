@@ -149,7 +149,7 @@ def test_opaque_alpha_texels_change_nothing(device: torch.device) -> None:
         torch.testing.assert_close(getattr(cut, name), getattr(plain, name), rtol=0, atol=2e-6, msg=name)
 
 
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+@pytest.mark.parametrize("kind", VIEW_COLORS)
 def test_view_colours_full_and_reduced(kind: str, device: torch.device, cpu) -> None:
     scene = textured(40, 1, kind=kind)
     check(scene, front(), device, cpu)

@@ -45,7 +45,7 @@ def reduced_parameters(kind: str, n: int, dtype: torch.dtype = torch.float64) ->
     }
 
 
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+@pytest.mark.parametrize("kind", VIEW_COLORS)
 def test_reduced_view_colors_against_the_reference(kind: str) -> None:
     n = 15
     g = torch.Generator().manual_seed(7)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from bitymi_ns.ops import view_color
-from bitymi_ns.ops.view_kinds import fibonacci_sphere
+from bitymi_ns.ops.view_kinds import VIEW_COLORS, fibonacci_sphere
 from bitymi_ns.scene.config import SceneConfig
 from bitymi_ns.scene.scene import Scene
 from bitymi_ns.train.config import DensifyConfig, TrainConfig
@@ -31,7 +31,7 @@ def cloud():
     return torch.randn(200, 3, generator=generator), torch.rand(200, 3, generator=generator)
 
 
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+@pytest.mark.parametrize("kind", VIEW_COLORS)
 def test_colours_are_those_of_the_points(cloud, kind):
     xyz, rgb = cloud
     surfels, _ = start(xyz, rgb, kind=kind)

@@ -118,7 +118,7 @@ def test_discs_far_larger_than_their_depth_are_drawn_whole(seed: int) -> None:
     assert np.abs(counts - want).max() <= 1 and (np.abs(counts - want) > 0.5).mean() < 1e-3
 
 
-@pytest.mark.parametrize("kind", ["sv", "sh", "sb", "sg"])
+@pytest.mark.parametrize("kind", VIEW_COLORS)
 @pytest.mark.parametrize("reduced", [False, True], ids=["all terms", "reduced"])
 def test_view_colours(kind: str, reduced: bool) -> None:
     scene = replace(textured(40, 1, kind=kind), weight_bound=0.0)

@@ -35,7 +35,7 @@ S = TypeVar("S", bound="Stage")
 
 
 class BakeableScene(Protocol):
-    """What the bake uses of a scene."""
+    """Provide what the bake uses of a scene."""
 
     @property
     def surfels(self) -> Tensors: ...

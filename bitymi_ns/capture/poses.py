@@ -47,7 +47,7 @@ def find_poses(
     capture: Path | None = None,
 ) -> FoundPoses:
     """Find camera poses of photographs (of a folder, or its `images`) or of a video's frames; cache them, and continue
-    an interrupted run. `warn` is told what is left out; `capture`: folder that may hold masks, too. Raises
+    an interrupted run. `warn` receives what is left out; `capture`: folder that may hold masks, too. Raises
     CaptureError: there are no poses; says what to photograph differently."""
     options = options or SfmOptions()
     tell = progress or no_progress

@@ -19,6 +19,16 @@ def _no_tiles(surfels: int, dtype: torch.dtype, device: torch.device) -> TexelTi
     return TexelTiles.of_sizes(size, torch.zeros(surfels, dtype=dtype, device=device))
 
 
+def image_channels(maps: bool) -> int:
+    """Count the channels of a blended image."""
+    return MAP_CHANNELS if maps else IMAGE_CHANNELS
+
+
+def blend_sums(maps: bool) -> int:
+    """Count the gradients per pair of surfel and tile that the backward pass sums (csrc/ops/blend.h)."""
+    return 8 if maps else 4
+
+
 def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, Tensor]:
     """Allocate working memory of the backward kernel by name; none on the CPU. `texels`: number T of texels with a
     gradient. On CUDA a row of four numbers each; with deterministic algorithms int64 sums instead, which do not depend
@@ -26,7 +36,7 @@ def backward_memory(fragments: Fragments, maps: bool, texels: int) -> dict[str, 
     like = fragments.weight
     if not cuda_backend(like.device):
         return {}
-    work = {"partial": like.new_empty(fragments.layout.handle.pairs, 8 if maps else 4)}  # gradients of surfels by pair
+    work = {"partial": like.new_empty(fragments.layout.handle.pairs, blend_sums(maps))}
     if texels and torch.are_deterministic_algorithms_enabled():
         numbers = module(like.device).exact_size(4 * texels)
         work["exact_work"] = torch.empty(numbers, dtype=torch.int64, device=like.device)
@@ -43,7 +53,7 @@ class _BlendedImage(torch.autograd.Function):
         t = dense(texels, geom)
         arrays = fragments.arrays
         r = None if residual is None else dense(residual, geom)
-        image = geom.new_empty(fragments.width * fragments.height, MAP_CHANNELS if maps else IMAGE_CHANNELS)
+        image = geom.new_empty(fragments.width * fragments.height, image_channels(maps))
         ctx.arguments = {"maps": maps, **fragments.view, **tiles.arrays, "bound": bound}
         kernel("blend_forward", geom)(**ctx.arguments, **arrays, geom=g, base=b, texels=t, residual=r, image=image)
         ctx.save_for_backward(g, b, t, r, *arrays.values())

@@ -10,8 +10,7 @@ from torch import Tensor
 from .backend import cuda_backend, dense, kernel, module
 from .bands import Unlisted
 from .bin_cuda import tile_lists
-from .blend import checked_texels
-from .constants import IMAGE_CHANNELS, MAP_CHANNELS
+from .blend import blend_sums, checked_texels, image_channels
 from .project import Projection
 from .texel import TexelDescent, TexelTiles, gradient_or_step
 from .trace_cuda import layout_of
@@ -31,7 +30,7 @@ class _Rasterized(torch.autograd.Function):
         pairs, pixels = len(bins.surfel), camera.width * camera.height
         masks = torch.empty(module(g.device).TILE_WARPS, pairs, dtype=torch.int32, device=g.device)
         cuts = torch.empty_like(masks) if projection.alpha is not None else None
-        image = g.new_empty(pixels, MAP_CHANNELS if maps else IMAGE_CHANNELS)
+        image = g.new_empty(pixels, image_channels(maps))
         transmittance = g.new_empty(pixels)
         ctx.arguments = {**projection.view(g), **projection.alpha_arrays, **tiles.arrays, "bound": bound, "maps": maps}
         kernel("rasterize_forward", g)(
@@ -61,7 +60,7 @@ class _Rasterized(torch.autograd.Function):
         }
         dtexels, step = gradient_or_step(texels, ctx.needs_input_grad[2], ctx.descent)
         work = {"partial": geom.new_empty(pairs, kernels.TRACE_SUMS)}
-        work["color_partial"] = geom.new_empty(pairs, 8 if ctx.arguments["maps"] else 4)
+        work["color_partial"] = geom.new_empty(pairs, blend_sums(ctx.arguments["maps"]))
         dalpha = torch.empty_like(texel_alpha) if ctx.needs_input_grad[3] else None
         if "moved" in step or dalpha is not None:
             work["texel_work"] = geom.new_empty(4 * len(texels))

@@ -32,6 +32,7 @@ template <class S> BT_HD Vec3<S> base_gradient(Vec3<S> f_view, Vec3<S> dresidual
 
 // Sums over a pixel's fragments, weighted: rgb, 1 and beta; with maps also depth and normal.
 constexpr int kImageChannels = 5, kMapChannels = 9;
+constexpr int channels_of(bool maps) { return maps ? kMapChannels : kImageChannels; }
 
 // The weight of a fragment, and the transmittance behind it.
 template <class T> struct Blend {

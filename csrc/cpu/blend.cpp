@@ -16,7 +16,7 @@ template <class S> using Blended = BlendedSurfels<S, TileBlocks>;
 template <class S> using Forward = BlendForward<S, TileBlocks>;
 template <class S> using Backward = BlendBackward<S, TileBlocks>;
 
-template <bool kMaps> constexpr int kChannels = kMaps ? kMapChannels : kImageChannels;
+template <bool kMaps> constexpr int kChannels = channels_of(kMaps);
 
 // Fragments of a surfel in a tile, ready for blending.
 template <class S> class SurfelRun {

@@ -23,7 +23,7 @@ __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1
                                                 : kMaps        ? 4
                                                                : 5)
     forward_kernel(BlendedSurfels<S, Pairs> of, S* __restrict__ image) {
-  constexpr int kHeld = 4096 / sizeof(S), kChannels = kMaps ? kMapChannels : kImageChannels;
+  constexpr int kHeld = 4096 / sizeof(S), kChannels = channels_of(kMaps);
   __shared__ int bits[kTileWarps][kWarp];
   __shared__ S weights[kHeld], colors[3][kHeld], depths[kMaps ? kHeld : 1];
   const Pairs& p = of.fragments.layout;
@@ -85,7 +85,7 @@ template <class S, bool kMaps, Residual kResidual> constexpr int resident() {
 template <class S, bool kMaps, Residual kResidual, bool kExact>
 __global__ void __launch_bounds__(kTileThreads, resident<S, kMaps, kResidual>())
     backward_kernel(BlendBackward<S, Pairs> a, ExactSums exact) {
-  constexpr int kChannels = kMaps ? kMapChannels : kImageChannels, kSums = blend_sums(kMaps);
+  constexpr int kChannels = channels_of(kMaps), kSums = blend_sums(kMaps);
   constexpr int kWorkers = kTileThreads / kRunLanes, kWhole = 8;
   constexpr bool kTexels = kResidual == Residual::kTexels, kListed = kResidual == Residual::kListed;
   __shared__ S gradient[kTileThreads * kChannels];

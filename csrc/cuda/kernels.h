@@ -152,7 +152,7 @@ template <class S> struct RasterizeForward : MarkedView<S> {
     check_tiles(r, table, this->alpha, this->view.n);
     r.numbers("bound", bound, "maps", maps);
     const int64_t pixels = int64_t(this->view.width) * this->view.height;
-    r.array("image", image, pixels * (maps ? kMapChannels : kImageChannels));
+    r.array("image", image, pixels * channels_of(maps));
     r.array("transmittance", transmittance, pixels);
   }
 };
@@ -203,9 +203,9 @@ template <class S> struct RasterizeBackward {
     if (alpha.values && !cuts) r.refuse("alpha texels need cuts");
     const int64_t pixels = int64_t(view.width) * view.height;
     r.array("transmittance", transmittance, pixels);
-    r.array("dimage", dimage, pixels * (maps ? kMapChannels : kImageChannels));
+    r.array("dimage", dimage, pixels * channels_of(maps));
     r.work("partial", partial, layout.pairs * kTraceSums);
-    r.work("color_partial", color_partial, layout.pairs * (maps ? 8 : 4));
+    r.work("color_partial", color_partial, layout.pairs * blend_sums(maps));
     r.array("dgeom", dgeom, view.n * kGeom);
     r.array("absgrad", absgrad, view.n * 2);
     r.array("dbase", dbase, view.n * 3);

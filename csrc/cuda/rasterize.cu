@@ -17,8 +17,6 @@ namespace bt::cuda {
 
 namespace {
 
-constexpr int channels_of(bool maps) { return maps ? kMapChannels : kImageChannels; }
-
 template <class S, bool kAlpha, bool kMaps>
 __global__ void __launch_bounds__(kTileThreads, sizeof(S) == 8 ? 1 : 4) forward_kernel(RasterizeForward<S> a) {
   using T = FastFloatOr<S>;
@@ -85,7 +83,7 @@ enum FragmentBits { kPixel = kTileThreads - 1, kOpenRed = kTileThreads, kCut = 8
 template <class S, bool kMaps> struct Held : SurfelRows<S> {
   static constexpr int kFragments = sizeof(S) == 8 ? (kMaps ? 256 : 320) : (kMaps ? 768 : 1024);
   static constexpr int kTurns = kFragments / kRunLanes + kWarp, kChannels = channels_of(kMaps);
-  static constexpr int kColors = kMaps ? 8 : 4;  // sums of a pair: view colour and, from kNormal on, normal
+  static constexpr int kColors = blend_sums(kMaps);  // sums of a pair: view colour and, from kNormal on, normal
   static constexpr int kNormal = 4;
   S gradient[kTileThreads * kChannels];
   S weight[kFragments], u[kFragments], v[kFragments], sigma[kFragments];  // sigma as listed

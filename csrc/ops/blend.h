@@ -15,7 +15,7 @@ template <class S, class Layout> struct BlendedSurfels {
   TexelTiles<S> table;
   const S* residual;  // [F, 3] residual of each fragment, instead of texels; or null
 
-  int64_t numbers() const { return int64_t(width) * height * (maps ? kMapChannels : kImageChannels); }
+  int64_t numbers() const { return int64_t(width) * height * channels_of(maps); }
   template <class R> void fields(R& r) {
     r.numbers("maps", maps, "width", width, "height", height, "bound", bound);
     table.fields(r);

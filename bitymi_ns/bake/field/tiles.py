@@ -29,8 +29,8 @@ PAPER_EXTENT = 4.0  # e of the paper's rule
 
 
 class Field(Protocol):
-    """What the bake uses of a residual field. Tiles follow the direction in which voxels are stretched if it also has
-    `geometry.mid`, the centre of its contraction; else the smaller edge holds for both axes."""
+    """Provide what the bake uses of a residual field. Tiles follow the direction in which voxels are stretched if it
+    also has `geometry.mid`, the centre of its contraction; else the smaller edge holds for both axes."""
 
     def __call__(self, x: Tensor) -> Tensor:
         """Map world positions [M, 3] to residual colours [M, 3]."""

@@ -1,4 +1,4 @@
-"""What is known of a capture beside nerfstudio's fields, in one record, from the reader to the model."""
+"""Carry the facts of a capture beside nerfstudio's fields, in one record, from the reader to the model."""
 
 from __future__ import annotations
 
